@@ -351,7 +351,10 @@ def read_pictures(path: Path) -> list[ViewedImage]:
             for pixels in found
         ]
     for page in pages:
-        check_numbers(path, page.pixels)
+        if page.pixels.dtype.kind not in "uif":
+            raise InputError(
+                path, f"pixels of type {page.pixels.dtype}", "integers and floats"
+            )
     return pages
 
 
@@ -488,12 +491,6 @@ def check_name(path: Path) -> None:
     if not image_suffix(path.name):
         raise InputError(path, "unknown image suffix", ", ".join(IMAGE_SUFFIXES))
     check_bytes(path, encoded.MAX_BYTES)
-
-
-def check_numbers(path: Path, pixels: NDArray) -> None:
-    """Raise InputError unless the pixels are real numbers."""
-    if pixels.dtype.kind not in "uif":
-        raise InputError(path, f"pixels of type {pixels.dtype}", "integers and floats")
 
 
 def is_fits(path: Path) -> bool:

@@ -202,14 +202,6 @@ class TextSegment(NamedTuple):
                 raise InputError(path, f"{key} is missing in the metadata of a segment")
 
 
-def keyword_value(path: str | Path, n: int, line: str) -> tuple[str, str]:
-    """The keyword and the value of a line. Raises InputError if it is not KEYWORD = value."""
-    key, equals, value = (part.strip() for part in line.partition("="))
-    if not equals:
-        raise Where(path, n).error(f"{excerpt(line)} is not KEYWORD = value")
-    return key, value
-
-
 def split_segments(
     path: str | Path,
     lines: Iterable[Line],
@@ -250,7 +242,9 @@ def split_segments(
         elif section == data:
             segments[-1].data.append((n, line.split()))
         elif section in ("", "META_START"):
-            key, value = keyword_value(path, n, line)
+            key, equals, value = (part.strip() for part in line.partition("="))
+            if not equals:
+                raise Where(path, n).error(f"{excerpt(line)} is not KEYWORD = value")
             if section:
                 segments[-1].metadata[key] = (n, value)
             elif key == keyword:

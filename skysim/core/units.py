@@ -38,6 +38,7 @@ from pydantic_core import CoreSchema, core_schema
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.types import Floats, frozen
+from skysim.core.yaml_reader import suggestion
 
 MAX_CHARACTERS = 80  # of a quantity
 QUANTITY_PATTERN = (
@@ -286,10 +287,17 @@ class ConfigModel(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def without_removed(cls, tree: Any) -> Any:
-        """The section without keys of the value null, where null is not allowed and the key has a default."""
+        """The section without keys of the value null, where null is not allowed and the key has a default.
+
+        Raises InputError for an unknown key, before a misspelled one is missed.
+        """
         if not isinstance(tree, Mapping):
             return tree
-        fields = {field.alias: field for field in cls.model_fields.values()}
+        fields = {str(field.alias): field for field in cls.model_fields.values()}
+        for key in tree:
+            if isinstance(key, str) and key not in fields:
+                names = ", ".join(name for name in fields if name.isidentifier())
+                raise InputError(key, f"unknown key{suggestion(key, [*fields])}", names)
         return {
             key: value
             for key, value in tree.items()

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import AfterValidator, BaseModel, ValidationError
+from pydantic import AfterValidator, ValidationError
 from pydantic_core import ErrorDetails
 
 from skysim.core import __version__
@@ -401,11 +401,7 @@ PATTERNS = {
 
 
 def explain(
-    error: ValidationError,
-    model: type[BaseModel],
-    tree: Tree,
-    files: Files,
-    overrides: OverrideTexts,
+    error: ValidationError, tree: Tree, files: Files, overrides: OverrideTexts
 ) -> InputError:
     """The first error of a validation: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
 
@@ -413,8 +409,6 @@ def explain(
     ----------
     error
         Error of pydantic
-    model
-        Model that was validated
     tree
         Merged content of the files
     files
@@ -422,12 +416,12 @@ def explain(
     overrides
         YAML texts by dotted key
     """
-    # 1. A misspelled key causes two errors, unknown and missing. Report the unknown one.
+    # 1. A key of another section may be missing too.
     first = min(error.errors(), key=lambda item: item["type"] == "missing")
     missing = first["type"] == "missing"
     # 2. Keys and problem.
     keys = [str(key) for key in yaml_keys(first["loc"], tree, missing)]
-    found = fault_of(first, model)
+    found = fault_of(first)
     if found.key:
         keys += found.key.split(".")
     # 3. A missing key has no line of its own, so the line is that of its section. (A file may have the key in a section
@@ -436,7 +430,7 @@ def explain(
     return InputError(excerpt(".".join(keys)), found.problem, found.allowed, where)
 
 
-def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
+def fault_of(error: ErrorDetails) -> InputError:
     """One error of pydantic as InputError; its key is relative to the error's location."""
     kind = error["type"]
     context = error.get("ctx", {})
@@ -444,10 +438,6 @@ def fault_of(error: ErrorDetails, model: type[BaseModel]) -> InputError:
     if kind == "value_error":
         cause = context["error"]
         return cause if isinstance(cause, InputError) else InputError("", cause)
-    if kind == "extra_forbidden":
-        known = allowed_keys(model, error["loc"][:-1])
-        names = ", ".join(name for name in known if name.isidentifier())
-        return InputError("", f"unknown key{suggestion(str(error['loc'][-1]), known)}", names)
     if kind == "missing":
         return InputError("", "missing")
     if kind == "union_tag_invalid":
@@ -497,40 +487,6 @@ def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int 
     return keys
 
 
-def allowed_keys(model: type[BaseModel], loc: tuple[int | str, ...]) -> list[str]:
-    """The allowed keys of a section, found by following an error's location through the JSON schema."""
-    schema = model.model_json_schema(by_alias=True)
-    node: Tree = schema
-    for key in loc:
-        node = resolve(node, schema)
-        # Branches of a union; an optional section has its union nested one level deeper.
-        branches = node.get("anyOf", []) + node.get("oneOf", [])
-        options = [resolve(option, schema) for option in branches]
-        nested = [option for outer in options for option in outer.get("oneOf", [])]
-        options += [resolve(option, schema) for option in nested]
-        if key in node.get("properties", {}):
-            node = node["properties"][key]
-        elif isinstance(key, int):
-            node = node.get("items", {})
-        else:
-            named = [o for o in options if key in (o.get("title"), kind_of(o))]
-            node = named[0] if named else node
-    return list(resolve(node, schema).get("properties", {}))
-
-
-def resolve(node: Tree, schema: Tree) -> Tree:
-    """The schema to which a node refers; for an optional section, that of the section."""
-    options = [option for option in node.get("anyOf", []) if option.get("type") != "null"]
-    if len(options) == 1:
-        node = options[0]
-    return schema["$defs"][node["$ref"].rsplit("/", 1)[1]] if "$ref" in node else node
-
-
-def kind_of(node: Tree) -> str | None:
-    """The literal of the key `kind` in a schema; None without one."""
-    return node.get("properties", {}).get("kind", {}).get("const")
-
-
 def suggestion(word: str, allowed: Sequence[str]) -> str:
     """Text with the most similar of the allowed words, to end a problem; empty if none is similar."""
     close = difflib.get_close_matches(word, allowed, 1)
@@ -555,7 +511,8 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
         if isinstance(node, yaml.SequenceNode):
             inner = [(str(n), item, item) for n, item in enumerate(node.value)]
         for name, place, value in inner:
-            lines[(*keys, name)] = place.start_mark.line + 1
+            # A key with dots, which is unknown, is found by its components.
+            lines[(*keys, *name.split("."))] = place.start_mark.line + 1
             visit(value, (*keys, name))
 
     visit(yaml.compose(text, yaml.SafeLoader), ())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import html
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
@@ -253,23 +254,20 @@ class FlightRecorder:
 
     def __init__(self, folder: Path, flight: Flight) -> None:
         self.flight = flight
-        self.folders = [folder, *(folder / camera.name for camera in flight.lab.cameras[1:])]
-        self.recorders: dict[str, Recorder] = {}
+        self.folder = folder
 
-    def of(self, camera: StarCamera) -> Recorder:
-        """The recorder of a camera."""
-        if not self.recorders:
-            self.recorders = {
-                one.name: Recorder(folder, one)
-                for one, folder in zip(self.flight.lab.cameras, self.folders, strict=True)
-            }
-        return self.recorders[camera.name]
+    @cached_property
+    def recorders(self) -> dict[str, Recorder]:
+        """By the name of the camera."""
+        main, *heads = self.flight.lab.cameras
+        found = {head.name: Recorder(self.folder / head.name, head) for head in heads}
+        return {main.name: Recorder(self.folder, main)} | found
 
     def record(self, shots: Iterable[Shot]) -> list[FrameRow]:
         """Solved shots, written as they come and not kept. Returns the rows of the main camera."""
         for shot in shots:
-            self.of(shot.camera).add(scoring.Score(shot))
-        return self.of(self.flight.lab.camera).rows
+            self.recorders[shot.camera.name].add(Score(shot))
+        return self.recorders[self.flight.lab.camera.name].rows
 
     def finish(
         self,
@@ -285,7 +283,7 @@ class FlightRecorder:
             Makes pictures of the laboratory for the main camera's report
         """
         main = run_of(self.flight, [() for _ in self.recorders])
-        pictures = draw(main.lab, main.telemetry, self.folders[0]) if draw else ()
+        pictures = draw(main.lab, main.telemetry, self.folder) if draw else ()
         motion = main.telemetry, main.imu_samples
         first, *others = self.recorders.values()
         finished = [first.finish(command, *motion, plan, pictures)]

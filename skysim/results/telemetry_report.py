@@ -287,11 +287,11 @@ def panels(log: Telemetry) -> list[Callable[[Telemetry, Any], None]]:
         attitude_panel: True,
         attitude_error_panel: log.lab_from_imu is not None or log.lab_from_ref is not None,
         bias_panel: log.lab_from_filter is not None,
-        mounting_panel: bool(log.mountings),
+        mounting_panel: log.mountings,
         torque_panel: controlled,
-        wheels_panel: controlled and bool(log.wheel_rad_s.size),
-        gimbals_panel: controlled and bool(log.gimbal_rad.size),
-        momentum_panel: controlled and bool(log.wheel_rad_s.size or log.gimbal_rad.size),
+        wheels_panel: controlled and log.wheel_rad_s.size,
+        gimbals_panel: controlled and log.gimbal_rad.size,
+        momentum_panel: controlled and (log.wheel_rad_s.size or log.gimbal_rad.size),
     }
     return [panel for panel, present in available.items() if present]
 

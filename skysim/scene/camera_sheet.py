@@ -112,11 +112,9 @@ WELL_E_UM2 = 900.0  # full well per square micrometer of the IMX264, the least o
 TRANSFER = "1 us"  # transfer time of a row of a charge-coupled device
 
 
-class AssumedValue(NamedTuple):
-    """A value that the data sheet does not state, and the reason for it."""
-
-    value: Any
-    why: str
+Assumption = tuple[
+    Any, str
+]  # a value that the data sheet does not state, and the reason for it
 
 
 class Question(NamedTuple):
@@ -144,14 +142,14 @@ class Question(NamedTuple):
     ask: str
     where: str
     parse: Callable[[str], Any]
-    assume: Callable[[Values], AssumedValue | None] = lambda values: None
+    assume: Callable[[Values], Assumption | None] = lambda values: None
     consequence: str = ""
     skipped: Callable[[Values], str] = lambda values: ""
 
 
-def assumed(value: Any, why: str) -> Callable[[Values], AssumedValue]:
+def assumed(value: Any, why: str) -> Callable[[Values], Assumption]:
     """An assumption that does not depend on the other values."""
-    return lambda values: AssumedValue(value, why)
+    return lambda values: (value, why)
 
 
 def without_lens(values: Values) -> str:
@@ -164,32 +162,30 @@ def not_by_rows(values: Values) -> str:
     return "with a global shutter" if values.get("shutter", "global") == "global" else ""
 
 
-def row_time(values: Values) -> AssumedValue:
+def row_time(values: Values) -> Assumption:
     """Assumed time from row to row of a shutter that is not global."""
     if values["shutter"] != "rolling":
-        return AssumedValue(TRANSFER, "a fast transfer")
-    return AssumedValue(f"{rounded(1e6 / 30 / values['pixels'][1])} us", "30 frames a second")
+        return TRANSFER, "a fast transfer"
+    return f"{rounded(1e6 / 30 / values['pixels'][1])} us", "30 frames a second"
 
 
-def full_well(values: Values) -> AssumedValue:
+def full_well(values: Values) -> Assumption:
     """Assumed full well: the converter's range in electrons if the gain is known, otherwise from the pixel's area."""
     if "gain" in values:
         well_e = values["gain"] * range_dn(values)
-        return AssumedValue(rounded(well_e), "where the converter's range ends")
+        return rounded(well_e), "where the converter's range ends"
     from skysim.core.units import in_si
 
     well_e = WELL_E_UM2 * (1e6 * in_si(values["pitch"], "m")) ** 2
     why = f"{WELL_E_UM2:g} e- a square micrometer, as in the IMX264"
-    return AssumedValue(rounded(well_e), why)
+    return rounded(well_e), why
 
 
-def gain_of_well(values: Values) -> AssumedValue:
+def gain_of_well(values: Values) -> Assumption:
     """Assumed gain, which maps the full well to the end of the range; rounded up to four digits."""
     exact = max(values["full_well"], 1e-3) / range_dn(values)
     step = 10.0 ** (math.floor(math.log10(exact)) - 3)
-    return AssumedValue(
-        rounded(step * math.ceil(exact / step)), "the range ends at the full well"
-    )
+    return rounded(step * math.ceil(exact / step)), "the range ends at the full well"
 
 
 def range_dn(values: Values) -> float:
@@ -281,7 +277,7 @@ QUESTIONS: dict[str, Question] = {
         "Black level, digital numbers",
         "offset or black level; or the mean of a dark frame",
         number("DN|ADU", "32"),
-        lambda values: AssumedValue(2 ** max(values["bits"] - 7, 0), "1/128 of the range"),
+        lambda values: (2 ** max(values["bits"] - 7, 0), "1/128 of the range"),
         "digital numbers do not compare with those of a real frame",
     ),
     "full_well": Question(
@@ -325,13 +321,12 @@ QUESTIONS: dict[str, Question] = {
         "centroid noise of bright lights is uncertain",
     ),
 }
-REQUIRED = tuple(name for name, question in QUESTIONS.items() if question.consequence == "")
 
 # The camera file.
 
 # Curve of the quantum efficiency by shutter.
 CURVES = {"interline": "interline", "frame_transfer": "thick_ccd"}
-# Values with which an answer is checked before these two are given.
+# The two answers that are required, with values with which another is checked before they are given.
 PLACEHOLDERS = {"pixels": "1000x1000", "pitch": "5 um"}
 PLACEHOLDER_LENS = {
     "focal_length": "1 m",
@@ -382,13 +377,13 @@ def fill(answers: Answers) -> Sheet:
             raise InputError(f"answers.{name}", f"has no effect {skipped}")
         if skipped or name in values:
             continue
-        if name in REQUIRED:
+        if name in PLACEHOLDERS:
             raise InputError(f"answers.{name}", f"missing; {question.ask}: {question.where}")
-        guess = question.assume(values)
-        if guess is not None:
-            values[name] = guess.value
-            comments[name] = f"assumed: {guess.why}"
-        text = f"{guess.value} ({guess.why})" if guess else ""
+        text = ""
+        if guess := question.assume(values):
+            values[name], why = guess
+            comments[name] = f"assumed: {why}"
+            text = f"{values[name]} ({why})"
         missing.append(Missing(name, text, question.consequence))
     sheet = Sheet(list(lines_of(values, comments)), missing)
     check(sheet, answers)
@@ -441,7 +436,7 @@ def check(sheet: Sheet, answers: Answers) -> None:
     except ValidationError as error:
         faults = []
         for one in error.errors():
-            fault = fault_of(one, CameraConfig)
+            fault = fault_of(one)
             section = ".".join(map(str, yaml_keys(one["loc"], tree, False)))
             faults.append(fault.under(section) if section else fault)
         # The first fault of a key that an answer sets, as an error of the answer; otherwise the first fault.

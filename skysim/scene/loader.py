@@ -333,7 +333,7 @@ def validate(layers: list["Layer"], overrides: OverrideTexts) -> Scene:
         raw = apply_preset(tree, files, overrides)
         scene = Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
     except ValidationError as error:
-        raise explain(error, Scene, tree, files, overrides) from None
+        raise explain(error, tree, files, overrides) from None
     trees = (with_overrides({}, overrides), *(layer.tree for layer in layers))
     scene._inherited = inherited_keys(trees)
     scene._source = RawKeys(tree)
@@ -578,7 +578,7 @@ def load_camera(
         raw = camera_tree(path, tree, files, overrides)
         return CameraFileConfig.model_validate(raw).camera
     except ValidationError as error:
-        raise explain(error, CameraFileConfig, tree, files, overrides) from None
+        raise explain(error, tree, files, overrides) from None
 
 
 def camera_tree(path: Path, tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:

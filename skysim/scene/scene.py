@@ -182,7 +182,7 @@ class SceneKind(ModelMetaclass):
         try:
             return super().__call__(**keys)
         except ValidationError as error:
-            raise explain(error, Scene, keys, [], {}) from None
+            raise explain(error, keys, [], {}) from None
 
 
 class Scene(ConfigModel, metaclass=SceneKind):
@@ -464,7 +464,7 @@ class Scene(ConfigModel, metaclass=SceneKind):
             except ValidationError as error:
                 first = error.errors()[0]
                 section = ".".join(map(str, ("heads", n, *first["loc"])))
-                raise fault_of(first, Scene).under(section) from None
+                raise fault_of(first).under(section) from None
         return self
 
     @property

@@ -13,7 +13,7 @@ give, and `shortfall` tells what they cannot. `Motion.advance` simulates a contr
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -275,23 +275,6 @@ def saturation_text(t_s: Floats, loads: Mapping[str, Floats]) -> str:
 # The mounting states of the filter.
 
 
-def mountings_by_camera(
-    mountings: Floats | None, t_s: Floats, cameras: Sequence[StarCamera]
-) -> dict[str, Mounting]:
-    """Estimates, sigmas and truth of the filter's mounting states (K, n, 2, 3), by name of the camera.
-
-    The state of a head is relative to that of the main camera.
-    """
-    if mountings is None or not mountings.size:
-        return {}
-    true_rad = np.array([mounting_rad(camera, t_s) for camera in cameras])
-    true_rad[1:] -= true_rad[0]
-    return {
-        camera.name: Mounting(mountings[:, n, 0], mountings[:, n, 1], true_rad[n])
-        for n, camera in enumerate(cameras)
-    }
-
-
 def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     """(K, 3) rotation vector of the attitude error from a camera's mount error and temperature, in body axes.
 
@@ -513,7 +496,16 @@ class Motion:
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
         t_s = steps * np.float64(simulation.step_s)
         rows["loads"] = dict(zip(self.flight_computer.names, rows["loads"].T, strict=True))
-        rows["mountings"] = mountings_by_camera(rows.get("mountings"), t_s, self.lab.cameras)
+        # The filter's mounting states (K, n, 2, 3); that of a head is relative to that of the main camera.
+        states_rad = rows.pop("mountings", np.zeros(0))
+        rows["mountings"] = {}
+        if states_rad.size:
+            true_rad = np.array([mounting_rad(camera, t_s) for camera in self.lab.cameras])
+            true_rad[1:] -= true_rad[0]
+            rows["mountings"] = {
+                camera.name: Mounting(states_rad[:, n, 0], states_rad[:, n, 1], true_rad[n])
+                for n, camera in enumerate(self.lab.cameras)
+            }
         for name in rows:
             if name.startswith("lab_from"):
                 rows[name] = Rotation.from_quat(rows[name], scalar_first=True)

@@ -126,7 +126,7 @@ def test_a_bare_number_takes_a_tolerance_too() -> None:
         ({"tolerance": 0.5}, "has no unit"),
         ({"tolerance": "0 mm"}, "greater than 0"),
         ({"tolerance": "-1 mm"}, "greater than 0"),
-        ({"tolerence": "1 mm"}, "Extra inputs"),
+        ({"tolerence": "1 mm"}, "unknown key; did you mean tolerance"),
         ({}, "an error requires a tolerance"),
         ({"distribution": "uniform"}, "uniform requires a tolerance"),
         (

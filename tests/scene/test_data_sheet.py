@@ -13,7 +13,6 @@ from skysim.scene import loader
 from skysim.scene.camera_sheet import (
     PLACEHOLDERS,
     QUESTIONS,
-    REQUIRED,
     fill,
     outstanding,
     text,
@@ -175,6 +174,7 @@ def test_a_wrong_answer_is_refused_with_the_allowed_values(
 
 
 def test_size_and_pitch_are_required() -> None:
-    assert set(REQUIRED) == set(PLACEHOLDERS)
+    required = {name for name, question in QUESTIONS.items() if question.consequence == ""}
+    assert required == set(PLACEHOLDERS)
     with pytest.raises(InputError, match=r"^answers\.pitch: missing; Pixel pitch"):
         fill({"pixels": "10x10"})

@@ -10,7 +10,7 @@ import pytest
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats
 from skysim.scene import loader
-from skysim.simulation.checks import attitudes, dome_warnings, findings, sky_warnings
+from skysim.simulation.checks import attitudes, findings, plan_check, sky_warnings
 from skysim.simulation.checks.detection import context_of
 from skysim.simulation.checks.expected_error import as_built, believed_px2, gains
 from skysim.simulation.checks.plan_check import check
@@ -163,7 +163,7 @@ def bent_arcsec(altitude_deg: Floats) -> Floats:
 def test_detectable_reflections_in_the_wall_are_warned_of() -> None:
     """As many as the tracker detects in a frame near a mirrored LED of its truth; none in a wall as dull as advised."""
     plan = plan_of("apl_dome", **SHINY)
-    line = dome_warnings.mirror_images(plan)
+    line = plan_check.mirror_images(plan)
     found = re.match(
         r"light.reflection.specular: the tracker detects up to (\d+) images .* change it to ([\d.]+)$",
         line,
@@ -176,7 +176,7 @@ def test_detectable_reflections_in_the_wall_are_warned_of() -> None:
     assert near > 0
     assert abs(int(found[1]) - near) <= max(1, 0.2 * near)
     dull = SHINY | {"light__reflection": f"{{specular: {found[2]}}}"}
-    assert not dome_warnings.mirror_images(plan_of("apl_dome", **dull))
+    assert not plan_check.mirror_images(plan_of("apl_dome", **dull))
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from skysim.core.errors import InputError
 from skysim.core.types import Floats, Frame, Telemetry
 from skysim.dynamics import imu, multibody
 from skysim.scene import loader
-from skysim.simulation.checks import check, dome_warnings
+from skysim.simulation.checks import check, plan_check
 from skysim.simulation.flight import Flight, simulate_motion
 from skysim.simulation.lab import build_lab, build_tracker
 from skysim.tracking import factory
@@ -415,7 +415,7 @@ def test_conditions_beyond_every_tracker_are_warned_of(
 ) -> None:
     """By hand: 8 mm at 33 in, 36.5 mm before pixels of 4 um, is 87 px; focused at 20 in 4.4 mm of pupil blur by 32."""
     lab = build_lab(loader.load("afit_simsat", changes))
-    lines = dome_warnings.warnings(lab)
+    lines = plan_check.dome_warnings(lab)
     assert len(lines) == 1
     assert lines[0].startswith(message)
     assert lines[0] in check(lab).findings

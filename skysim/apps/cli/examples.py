@@ -2,6 +2,7 @@
 
 import inspect
 import re
+from copy import copy
 from typing import Annotated, Any
 
 import typer
@@ -37,9 +38,10 @@ def documented(command: Any) -> None:
         kind = options[name].annotation
         if not hasattr(kind, "__metadata__"):
             kind = Annotated[kind, typer.Option(f"--{name.rstrip('_').replace('_', '-')}")]
-        parameter = kind.__metadata__[0]
+        parameter = copy(kind.__metadata__[0])  # options of one type share it
         parameter.help = " ".join(explained.split())
         parameter.metavar = metavar or parameter.metavar
+        kind = Annotated[kind.__origin__, parameter]
         options[name] = options[name].replace(annotation=kind)
     command.__doc__ = text
     command.__signature__ = signature.replace(parameters=list(options.values()))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -14,11 +14,7 @@ from skysim.core.paths import shipped_files, title_of
 from skysim.results.report import (
     Cell,
     Column,
-    Facts,
-    Items,
     Table,
-    Text,
-    print_blocks,
     print_table,
     print_wrapped,
     text_column,
@@ -30,11 +26,7 @@ if TYPE_CHECKING:
 
     from skysim.core.types import Record, Telemetry
     from skysim.experiments.study.execution.runner import Progress
-    from skysim.experiments.study.execution.store import Store
-    from skysim.experiments.study.plan import Plan
-    from skysim.experiments.study.worst import WorstTrial
     from skysim.experiments.tracker_comparison import TrackerScore
-    from skysim.simulation.checks.facts import Fact
     from skysim.simulation.lab import Lab
 
 
@@ -120,12 +112,6 @@ def fail_if_not_met(judged: Iterable[Mapping[str, Any]]) -> None:
 
     if any(one["answer"] == NOT_MET for one in judged):
         raise Exit(1)
-
-
-def print_check(facts: Sequence[Fact], findings: Sequence[str]) -> None:
-    """Print the facts of a check, with names at the left, and its warnings."""
-    warnings = [Items(findings, tone="warning")] if findings else [Text("no warnings")]
-    print_blocks([Facts([(fact.name, fact.lines) for fact in facts]), *warnings])
 
 
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:
@@ -298,60 +284,6 @@ REPLAYED = (
     "stars",
     "matched",
 )
-
-
-def study_status(plan: Plan, store: Store) -> Record:
-    """Progress and provenance of a study: trial counts, code version, run time and store."""
-    return {
-        "study": plan.name,
-        "title": plan.study.title,
-        "trials": plan.study.trial_count(len(plan.points)),
-        **store.counts(),
-        "code": store.meta("code"),
-        "seconds": sum(run["seconds"] for run in store.runs()),
-        "store": str(store.path),
-    }
-
-
-def print_study_status(status: Record) -> None:
-    seconds = status["seconds"]
-    speed = "its first run has not ended"
-    if seconds:
-        speed = f"{seconds:.1f} s, {status['done'] / seconds:.2g} trials/s"
-    print_wrapped(
-        f"{status['title']}: {status['done']} of {status['trials']} trials, {status['failed']} failed,"
-        f" {status['wrong']} wrong attitudes; {speed}"
-    )
-    print(f"store: {status['store']} (code {status['code']})")
-
-
-def print_worst(
-    response: str,
-    found: Sequence[WorstTrial],
-    levels: Sequence[Mapping[str, Any]],
-    repeat: str,
-    instead: str,
-) -> None:
-    """Print the worst attitudes by a quantity or a share, settings that start there, and commands that repeat them.
-
-    Parameters
-    ----------
-    levels
-        Levels of each trial's point
-    instead
-        The command that is printed if no trial counts for the response
-    """
-    if not found:
-        print(f"no trial counts for {response}; rank them by an error: {instead}")
-    for rank, (one, level) in enumerate(zip(found, levels, strict=True), 1):
-        at = ", ".join(f"{name} = {value}" for name, value in level.items())
-        print(
-            f"{rank}. {response} {one.value:.4g}: {one.direction}, {one.lights:.0f} lights: {printable(one.event)}"
-            f" ({printable(at)})"
-        )
-        if one.start:
-            print(f"   {one.start}")
-        print(f"   {repeat} {one.trial}")
 
 
 def print_replay(replay: Record) -> None:

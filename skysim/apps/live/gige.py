@@ -25,7 +25,7 @@ import threading
 import time
 import uuid
 from collections import deque
-from collections.abc import Container, Mapping
+from collections.abc import Container
 from enum import IntEnum
 from typing import Any
 
@@ -82,41 +82,159 @@ class RefusedError(Exception):
     """A command that is answered with the status in its argument."""
 
 
-class ControlChannel:
-    """Registers, and the one application that may write them. A camera adds what the methods without a body do.
+# Further registers of GigE Vision.
+ADDRESS = 0x0024
+PACKET_SIZE = 0x0D04
+PACKET_DELAY = 0x0D08  # ns
+STREAM_ADDRESS = 0x0D18
+# Its own, as in data/gige_camera.xml.
+PIXEL_FORMAT = 0xA008
+PAYLOAD_BYTES = 0xA00C
+EXPOSURE_US = 0xA010
+LONGEST_US = 0xA018
+CELSIUS = 0xA028
+ACQUISITION_MODE = 0xA038
+START = 0xA03C
+STOP = 0xA040
+TRIGGER_MODE = 0xA044
+TRIGGER = 0xA048
+XML = 0x10000
+XML_BYTES = 0x4000  # room for it
 
-    Attributes
+PIXEL_BITS = {0x01080001: 8, 0x01100005: 12, 0x01100007: 16}  # of Mono8, Mono12, Mono16
+# Allowed values of the registers that can be written; None for one of 8 bytes, a float, which `effect` checks.
+WRITABLE: dict[int, Container[int] | None] = {
+    HEARTBEAT: range(500, 600_001),
+    PRIVILEGE: range(4),
+    STREAM_PORT: range(1 << 16),
+    PACKET_SIZE: range(576, 16129),
+    PACKET_DELAY: range(10_000_001),
+    STREAM_ADDRESS: range(1 << 32),
+    PIXEL_FORMAT: PIXEL_BITS,
+    EXPOSURE_US: None,
+    ACQUISITION_MODE: range(2),
+    START: {1},
+    STOP: {1},
+    TRIGGER_MODE: range(2),
+    TRIGGER: {1},
+}
+# First addresses and ends of what can be read.
+RANGES = (
+    (0, 0x00F8),
+    (0x0200, 0x0604),
+    (0x0900, 0x0944),
+    (0x0A00, 0x0A04),
+    (0x0D00, 0x0D20),
+    (0xA000, 0xA04C),
+    (XML, XML + XML_BYTES),
+)
+HEADER_BYTES = 36  # of IP, UDP and GVSP in a packet
+LEADER = 1
+TRAILER = 2
+PIXELS = 3
+IMAGE = 1  # type of payload
+MOST_BLOCKS = 4  # that are kept
+POLL_S = 0.1
+
+
+class GigeCamera(Sink):
+    """The camera of a live flight: registers, and the one application that may write them.
+
+    The interface is that of `Output`.
+
+    Parameters
     ----------
-    ranges
-        First addresses and ends of what can be read
-    allowed
-        Allowed values of the registers that can be written, by address; None for one of 8 bytes, a float, which
-        `effect` checks
+    live
+        The flight; commands go into its inbox
+    host, port
+        IPv4 address or name to serve on
+
+    Raises
+    ------
+    InputError
+        For an address that cannot be bound, and a detector whose frames are not whole numbers.
     """
 
-    ranges: tuple[tuple[int, int], ...]
-    allowed: Mapping[int, Container[int] | None]
-
-    def __init__(self) -> None:
-        self.memory = bytearray(self.ranges[-1][1])
+    def __init__(self, live: Live, host: str, port: int = GVCP_PORT) -> None:
+        self.live = live
+        self.scene = live.flight.lab.scene
+        if not self.scene.camera.detector.noise:
+            raise InputError(
+                "--gige", "a camera without noise has no whole numbers", "noise: true"
+            )
+        self.socket = udp_socket()
+        try:
+            self.socket.bind((host, port))
+        except OSError as error:
+            self.socket.close()
+            problem = f"cannot serve on {host}:{port}: {reason(error)}"
+            raise InputError("--gige", problem, "an IPv4 address that is free") from None
+        self.host, self.port = self.socket.getsockname()
+        self.is_local = self.host.startswith("127.")
+        self.broadcasts = udp_socket()
+        # Several cameras of a machine hear the same broadcast.
+        self.broadcasts.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        # Not every system allows it, and 0.0.0.0 hears broadcasts by itself.
+        with contextlib.suppress(OSError):
+            self.broadcasts.bind(("255.255.255.255", port))
+        self.stream = udp_socket()
+        self.stream.bind((self.host, 0))
+        self.start_s = 0.0
+        self.block = 0
+        self.blocks: deque[tuple[int, list[bytes]]] = deque(maxlen=MOST_BLOCKS)
+        self.entered = live.entered
+        self.memory = bytearray(XML + XML_BYTES)
         self.controller: Sender | None = None
         self.heard_s = 0.0
         # It remembers its newest answer.
         self.answer_once = functools.lru_cache(maxsize=1)(self.first_answer)
+        self.fill_memory()
+        super().__init__("gige", self.send_frame, ())
+        threading.Thread(target=self.serve, name="gvcp", daemon=True).start()
 
-    def refresh(self) -> None:
-        """Update the registers whose values change, before they are read."""
+    # Registers
 
-    def effect(self, address: int, value: Any) -> None:
-        """Do what the writing of a register means. Raises InputError or RefusedError, and it keeps its value."""
-
-    def resend(self, block: int, first: int, last: int) -> None:
-        """Send packets of a block again."""
-
-    def stop(self) -> None:
-        """Send no more frames."""
-
-    # Memory
+    def fill_memory(self) -> None:
+        """Set the registers to their first values."""
+        camera = self.scene.camera
+        detector = camera.detector
+        celsius = detector.temperature_c
+        serial = uuid.getnode()
+        for address, value in {
+            0x0000: struct.pack(
+                ">IIQII12x4s32x32s32s32s48s16s15s",
+                0x00010002,  # version 1.2
+                0x80000001,  # big-endian, UTF-8
+                serial,  # address of the hardware
+                4,  # configured by link-local address
+                4,
+                socket.inet_aton(self.host),
+                b"skysim",
+                b"star camera",
+                __version__.encode(),
+                b"simulated",
+                b"%012x" % serial,
+                self.scene.name.encode(),
+            ),
+            0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
+            0x0600: 1,  # network interface
+            0x0904: 1,  # stream channel
+            0x0934: 0xC0000007,  # name, serial number; resend, WRITEMEM, several registers in a command
+            HEARTBEAT: 3000,
+            0x0940: 1_000_000_000,  # ticks of the clock a second
+            PACKET_SIZE: 1500,
+            0x0D1C: self.stream.getsockname()[1],
+            0xA000: camera.width_px,
+            0xA004: camera.height_px,
+            PIXEL_FORMAT: next(code for code, n in PIXEL_BITS.items() if n >= detector.bits),
+            # Whole microseconds: the longest exposure must not be refused for its rounding.
+            LONGEST_US: 1e6 * self.live.commands.longest_exposure_s // 1,
+            0xA020: 1 / detector.gain_e_dn,
+            CELSIUS: detector.dark_temperature_c if celsius is None else celsius,
+            0xA030: self.scene.exposure.rate_hz,
+            XML: (DATA / "gige_camera.xml").read_bytes().ljust(XML_BYTES, b"\n"),
+        }.items():
+            self.put(address, value)
 
     def put(self, address: int, value: float | bytes) -> None:
         """Set a register: an int of 4 bytes, a float of 8, or bytes."""
@@ -134,7 +252,7 @@ class ControlChannel:
             raise RefusedError(GvcpStatus.BAD_ALIGNMENT)
         if size > MOST_BYTES:
             raise RefusedError(GvcpStatus.INVALID_PARAMETER)
-        if not any(first <= address <= end - size for first, end in self.ranges):
+        if not any(first <= address <= end - size for first, end in RANGES):
             raise RefusedError(GvcpStatus.INVALID_ADDRESS)
         self.refresh()
         return bytes(self.memory[address : address + size])
@@ -145,9 +263,9 @@ class ControlChannel:
         if sender != self.controller and (self.controller or address != PRIVILEGE):
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
         self.read(address, len(data))
-        if address not in self.allowed:
+        if address not in WRITABLE:
             raise RefusedError(GvcpStatus.WRITE_PROTECT)
-        allowed = self.allowed[address]
+        allowed = WRITABLE[address]
         (value,) = struct.unpack(">d" if allowed is None else ">I", data)
         if allowed is not None and value not in allowed:
             raise RefusedError(GvcpStatus.INVALID_PARAMETER)
@@ -164,11 +282,6 @@ class ControlChannel:
         self.put(PRIVILEGE, 0)
         self.stop()
         self.put(STREAM_PORT, 0)
-
-    def check_heartbeat(self, now_s: float) -> None:
-        """Take the control from an application that was not heard for the heartbeat's timeout."""
-        if self.controller and now_s - self.heard_s > 1e-3 * self.value(HEARTBEAT):
-            self.release()
 
     # Datagrams
 
@@ -232,156 +345,7 @@ class ControlChannel:
             return struct.pack(">I", len(payload) // 8 if command == WRITEREG else size)
         raise RefusedError(GvcpStatus.NOT_IMPLEMENTED)
 
-
-# The camera.
-
-# Registers of GigE Vision that the camera uses.
-ADDRESS = 0x0024
-PACKET_SIZE = 0x0D04
-PACKET_DELAY = 0x0D08  # ns
-STREAM_ADDRESS = 0x0D18
-# Its own, as in data/gige_camera.xml.
-PIXEL_FORMAT = 0xA008
-PAYLOAD_BYTES = 0xA00C
-EXPOSURE_US = 0xA010
-LONGEST_US = 0xA018
-CELSIUS = 0xA028
-ACQUISITION_MODE = 0xA038
-START = 0xA03C
-STOP = 0xA040
-TRIGGER_MODE = 0xA044
-TRIGGER = 0xA048
-XML = 0x10000
-XML_BYTES = 0x4000  # room for it
-
-PIXEL_BITS = {0x01080001: 8, 0x01100005: 12, 0x01100007: 16}  # of Mono8, Mono12, Mono16
-WRITABLE = {
-    HEARTBEAT: range(500, 600_001),
-    PRIVILEGE: range(4),
-    STREAM_PORT: range(1 << 16),
-    PACKET_SIZE: range(576, 16129),
-    PACKET_DELAY: range(10_000_001),
-    STREAM_ADDRESS: range(1 << 32),
-    PIXEL_FORMAT: PIXEL_BITS,
-    EXPOSURE_US: None,
-    ACQUISITION_MODE: range(2),
-    START: {1},
-    STOP: {1},
-    TRIGGER_MODE: range(2),
-    TRIGGER: {1},
-}
-HEADER_BYTES = 36  # of IP, UDP and GVSP in a packet
-LEADER = 1
-TRAILER = 2
-PIXELS = 3
-IMAGE = 1  # type of payload
-MOST_BLOCKS = 4  # that are kept
-POLL_S = 0.1
-
-
-class GigeCamera(Sink, ControlChannel):
-    """The camera of a live flight. The interface is that of `Output`.
-
-    Parameters
-    ----------
-    live
-        The flight; commands go into its inbox
-    host, port
-        IPv4 address or name to serve on
-
-    Raises
-    ------
-    InputError
-        For an address that cannot be bound, and a detector whose frames are not whole numbers.
-    """
-
-    ranges = (
-        (0, 0x00F8),
-        (0x0200, 0x0604),
-        (0x0900, 0x0944),
-        (0x0A00, 0x0A04),
-        (0x0D00, 0x0D20),
-        (0xA000, 0xA04C),
-        (XML, XML + XML_BYTES),
-    )
-    allowed = WRITABLE
-
-    def __init__(self, live: Live, host: str, port: int = GVCP_PORT) -> None:
-        self.live = live
-        self.scene = live.flight.lab.scene
-        if not self.scene.camera.detector.noise:
-            raise InputError(
-                "--gige", "a camera without noise has no whole numbers", "noise: true"
-            )
-        self.socket = udp_socket()
-        try:
-            self.socket.bind((host, port))
-        except OSError as error:
-            self.socket.close()
-            problem = f"cannot serve on {host}:{port}: {reason(error)}"
-            raise InputError("--gige", problem, "an IPv4 address that is free") from None
-        self.host, self.port = self.socket.getsockname()
-        self.is_local = self.host.startswith("127.")
-        self.broadcasts = udp_socket()
-        # Several cameras of a machine hear the same broadcast.
-        self.broadcasts.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        # Not every system allows it, and 0.0.0.0 hears broadcasts by itself.
-        with contextlib.suppress(OSError):
-            self.broadcasts.bind(("255.255.255.255", port))
-        self.stream = udp_socket()
-        self.stream.bind((self.host, 0))
-        self.start_s = 0.0
-        self.block = 0
-        self.blocks: deque[tuple[int, list[bytes]]] = deque(maxlen=MOST_BLOCKS)
-        self.entered = live.entered
-        ControlChannel.__init__(self)
-        self.fill_memory()
-        Sink.__init__(self, "gige", self.send_frame, ())
-        threading.Thread(target=self.serve, name="gvcp", daemon=True).start()
-
-    # Registers
-
-    def fill_memory(self) -> None:
-        """Set the registers to their first values."""
-        camera = self.scene.camera
-        detector = camera.detector
-        celsius = detector.temperature_c
-        serial = uuid.getnode()
-        for address, value in {
-            0x0000: struct.pack(
-                ">IIQII12x4s32x32s32s32s48s16s15s",
-                0x00010002,  # version 1.2
-                0x80000001,  # big-endian, UTF-8
-                serial,  # address of the hardware
-                4,  # configured by link-local address
-                4,
-                socket.inet_aton(self.host),
-                b"skysim",
-                b"star camera",
-                __version__.encode(),
-                b"simulated",
-                b"%012x" % serial,
-                self.scene.name.encode(),
-            ),
-            0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
-            0x0600: 1,  # network interface
-            0x0904: 1,  # stream channel
-            0x0934: 0xC0000007,  # name, serial number; resend, WRITEMEM, several registers in a command
-            HEARTBEAT: 3000,
-            0x0940: 1_000_000_000,  # ticks of the clock a second
-            PACKET_SIZE: 1500,
-            0x0D1C: self.stream.getsockname()[1],
-            0xA000: camera.width_px,
-            0xA004: camera.height_px,
-            PIXEL_FORMAT: next(code for code, n in PIXEL_BITS.items() if n >= detector.bits),
-            # Whole microseconds: the longest exposure must not be refused for its rounding.
-            LONGEST_US: 1e6 * self.live.commands.longest_exposure_s // 1,
-            0xA020: 1 / detector.gain_e_dn,
-            CELSIUS: detector.dark_temperature_c if celsius is None else celsius,
-            0xA030: self.scene.exposure.rate_hz,
-            XML: (DATA / "gige_camera.xml").read_bytes().ljust(XML_BYTES, b"\n"),
-        }.items():
-            self.put(address, value)
+    # What registers mean
 
     def refresh(self) -> None:
         """Update the registers whose values change."""
@@ -443,7 +407,10 @@ class GigeCamera(Sink, ControlChannel):
                     for ready in select.select(sockets, (), (), POLL_S)[0]:
                         datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
                         self.reply(datagram, sender, ready is self.broadcasts)
-                    self.check_heartbeat(time.monotonic())
+                    # An application that was not heard for the heartbeat's timeout has gone.
+                    silent_s = time.monotonic() - self.heard_s
+                    if self.controller and silent_s > 1e-3 * self.value(HEARTBEAT):
+                        self.release()
 
     def reply(self, datagram: bytes, sender: Sender, is_broadcast: bool) -> None:
         """Answer a datagram, if it has an answer."""

@@ -37,6 +37,7 @@ from skysim.apps.live.packets import (
     frame_packet,
     plain,
     solution_packet,
+    values_of,
 )
 from skysim.core.errors import InputError, repeat_lost_interrupt
 from skysim.core.plugins import finite_array
@@ -204,8 +205,8 @@ class Live:
         # 4. Values.
         wanted = self.wanted
         made_unix_s = time.monotonic() + self.pace.offset_s
-        for channel, values_of in PERIODIC.items():
-            values = values_of(flight, began_s) if channel in wanted else {}
+        for channel in PERIODIC:
+            values = values_of(channel, flight, began_s) if channel in wanted else {}
             if values:
                 head = {"channel": channel, "t_s": now_s, "made_unix_s": made_unix_s}
                 self.send(Packet(head | plain(values)))

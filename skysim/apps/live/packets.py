@@ -172,32 +172,35 @@ def solution_packet(shot: Shot, made_unix_s: float) -> Packet:
 # The values of the periodic channels at the end of a control period that began at a time.
 
 
-def imu_values(flight: Flight, began_s: float) -> Record:
-    """The samples of the period. A unit slower than the control has none in most of them."""
-    samples = flight.imu_samples(began_s)
-    # Those of earlier periods were sent.
-    if samples is None or not (new := samples.t_s > began_s + TIME_TOLERANCE_S).any():
-        return {}
-    return {
-        "step_s": samples.step_s,
-        "times_s": samples.t_s[new],
-        "angle_rad": samples.angle_rad[new],
-        "velocity_m_s": samples.velocity_m_s[new],
-    }
+PERIODIC = ("imu", "state", "telemetry", "truth")  # have values every control period
+CHANNELS = ("frame", "solution", *PERIODIC)
 
 
-def state_values(flight: Flight, _: float) -> Record:
-    """The encoders."""
-    state = flight.state
-    return {
-        "wheel_rad_s": state.wheel_rad_s,
-        "gimbal_rad": state.gimbal_rad,
-        **state.readings,
-    }
-
-
-def telemetry_values(flight: Flight, _: float) -> Record:
-    """What the flight computer commands and estimates."""
+def values_of(channel: str, flight: Flight, began_s: float) -> Record:
+    """The values of a channel for a control period from its beginning to now."""
+    match channel:
+        case "imu":
+            # A unit slower than the control has no sample in most periods. Those of earlier periods were sent.
+            samples = flight.imu_samples(began_s)
+            if samples is None or not (new := samples.t_s > began_s + TIME_TOLERANCE_S).any():
+                return {}
+            return {
+                "step_s": samples.step_s,
+                "times_s": samples.t_s[new],
+                "angle_rad": samples.angle_rad[new],
+                "velocity_m_s": samples.velocity_m_s[new],
+            }
+        case "state":  # the encoders
+            state = flight.state
+            joints = {"wheel_rad_s": state.wheel_rad_s, "gimbal_rad": state.gimbal_rad}
+            return joints | state.readings
+        case "truth":
+            state = flight.state
+            return {
+                "lab_from_body_xyzw": state.lab_from_body.as_quat(),
+                "rate_body_rad_s": state.rate_body_rad_s,
+            }
+    # What the flight computer commands and estimates.
     computer = flight.motion.flight_computer
     navigation = flight.motion.navigation
     values: Record = {
@@ -211,24 +214,6 @@ def telemetry_values(flight: Flight, _: float) -> Record:
             values["lab_from_filter_xyzw"] = np.roll(attitude_wxyz, -1)
             values["bias_rad_s"] = navigation.filter.state.bias_rad_s
     return values
-
-
-def truth_values(flight: Flight, _: float) -> Record:
-    """True attitude and rate."""
-    state = flight.state
-    return {
-        "lab_from_body_xyzw": state.lab_from_body.as_quat(),
-        "rate_body_rad_s": state.rate_body_rad_s,
-    }
-
-
-PERIODIC: dict[str, Callable[[Flight, float], Record]] = {
-    "imu": imu_values,
-    "state": state_values,
-    "telemetry": telemetry_values,
-    "truth": truth_values,
-}
-CHANNELS = ("frame", "solution", *PERIODIC)
 
 
 MOST_FRAMES = 3  # frames in the queue of a sink, with the one that it writes

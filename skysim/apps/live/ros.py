@@ -8,7 +8,7 @@ z forward), and the first row of pixels is the upper one.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -32,7 +32,6 @@ CAMERA = "camera_optical_frame"
 MOST_WAITING = 64  # messages for a slow client of Foxglove, each of which may be a frame
 
 Message = dict[str, Any]
-Messages = Iterator[Message]
 
 
 class RosEncoder:
@@ -76,7 +75,7 @@ class RosEncoder:
         times_s = packet.header.get("times_s", [packet.header["t_s"]])
         for topic in topics:
             if topic.channel == packet.channel:
-                for t_s, message in zip(times_s, topic.messages(self, packet), strict=False):
+                for t_s, message in zip(times_s, self.messages(topic, packet), strict=False):
                     stamp_ns, message["header"] = self.stamped(
                         t_s, topic.frame or self.reference
                     )
@@ -89,50 +88,66 @@ class RosEncoder:
         sec, nanosec = divmod(stamp_ns, 10**9)
         return stamp_ns, {"stamp": {"sec": sec, "nanosec": nanosec}, "frame_id": frame}
 
+    def messages(self, topic: Topic, packet: Packet) -> Iterator[Message]:
+        """The messages of a packet on a topic, but for their headers."""
+        header = packet.header
+        match topic.name:
+            case "/camera/camera_info":
+                # The assumed calibration: K, D of plumb_bob, R = 1, and P = [K 0], so that rectifying keeps the scale.
+                camera = self.camera
+                fx = camera.focal_px
+                fy = fx * camera.aspect
+                cx, cy = camera.center_px
+                yield {
+                    "height": camera.height_px,
+                    "width": camera.width_px,
+                    "distortion_model": "plumb_bob",
+                    "d": camera.distortion,
+                    "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+                    "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
+                    "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
+                }
+            case "/camera/image_raw":
+                # Height and width have the same names in the packet; a color camera's frame is a Bayer mosaic.
+                pixels = packet.pixels
+                bits = 8 * pixels.itemsize
+                color = f"{self.color}{bits}" if pixels.dtype.kind == "u" else f"{bits}FC1"
+                data = pixels.tobytes()
+                yield header | {"encoding": color, "step": pixels.strides[0], "data": data}
+            case "/imu/data_raw":
+                # Mean rate and specific force of each sample, stamped at the end of its interval. There is no attitude
+                # (-1), and the covariances are unknown (0, as `sensor_msgs/Imu` says).
+                step_s = header["step_s"]
+                increments = zip(header["angle_rad"], header["velocity_m_s"], strict=True)
+                for angle_rad, velocity_m_s in increments:
+                    yield {
+                        "orientation_covariance": [-1],
+                        "angular_velocity": named(np.divide(angle_rad, step_s)),
+                        "linear_acceleration": named(np.divide(velocity_m_s, step_s)),
+                    }
+            case "/star_tracker/attitude" | "/truth/camera":
+                # Of a frame the true mean over its exposure, with which its solution is compared.
+                solved = header.get("cam_from_ref_xyzw")
+                if found := packet.truth.get("mean_cam_from_ref_xyzw", solved):
+                    yield {"quaternion": named(Rotation.from_quat(found).inv().as_quat())}
+            case "/truth/attitude":
+                yield {"quaternion": named(header["lab_from_body_xyzw"])}
+            case "/tf":
+                yield {"transforms": list(self.transforms(header))}
 
-def image(encoder: RosEncoder, packet: Packet) -> Messages:
-    """The frame, whose height and width have the same names in the packet; a color camera's is a Bayer mosaic."""
-    pixels = packet.pixels
-    bits = 8 * pixels.itemsize
-    yield packet.header | {
-        "encoding": f"{encoder.color}{bits}" if pixels.dtype.kind == "u" else f"{bits}FC1",
-        "step": pixels.strides[0],
-        "data": pixels.tobytes(),
-    }
-
-
-def camera_info(encoder: RosEncoder, _: Packet) -> Messages:
-    """The assumed calibration: K, D of plumb_bob, R = 1, and P = [K 0], so that rectifying keeps the scale."""
-    camera = encoder.camera
-    fx = camera.focal_px
-    fy = fx * camera.aspect
-    cx, cy = camera.center_px
-    yield {
-        "height": camera.height_px,
-        "width": camera.width_px,
-        "distortion_model": "plumb_bob",
-        "d": camera.distortion,
-        "k": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
-        "r": [1, 0, 0, 0, 1, 0, 0, 0, 1],
-        "p": [fx, 0, cx, 0, 0, fy, cy, 0, 0, 0, 1, 0],
-    }
-
-
-def imu(_: RosEncoder, packet: Packet) -> Messages:
-    """Mean rate and specific force of each sample, stamped at the end of its interval.
-
-    There is no attitude (-1), and the covariances are unknown (0, as `sensor_msgs/Imu` says).
-    """
-    header = packet.header
-    step_s = header["step_s"]
-    for angle_rad, velocity_m_s in zip(
-        header["angle_rad"], header["velocity_m_s"], strict=True
-    ):
-        yield {
-            "orientation_covariance": [-1],
-            "angular_velocity": named(np.divide(angle_rad, step_s)),
-            "linear_acceleration": named(np.divide(velocity_m_s, step_s)),
-        }
+    def transforms(self, header: Message) -> Iterator[Message]:
+        """The mount of the camera, and the estimated attitude of the body, of the filter if there is one."""
+        mount = named(self.lever.cam_from_body.inv().as_quat())
+        links = [(BODY, CAMERA, named(self.lever.camera_body_m), mount)]
+        found = header.get("lab_from_filter_xyzw", header.get("lab_from_imu_xyzw"))
+        if found:
+            links.append((self.reference, BODY, {}, named(found)))
+        for parent, child, place, rotation in links:
+            yield {
+                "header": self.stamped(header["t_s"], parent)[1],
+                "child_frame_id": child,
+                "transform": {"translation": place, "rotation": rotation},
+            }
 
 
 def named(numbers: Iterable[float]) -> Message:
@@ -140,47 +155,13 @@ def named(numbers: Iterable[float]) -> Message:
     return dict(zip("xyzw", numbers, strict=False))
 
 
-def transforms(encoder: RosEncoder, packet: Packet) -> Messages:
-    """The estimated attitude of the body, of the filter if there is one, and the mount of the camera."""
-    header = packet.header
-    lever = encoder.lever
-    mount = named(lever.cam_from_body.inv().as_quat())
-    links = [(BODY, CAMERA, named(lever.camera_body_m), mount)]
-    found = header.get("lab_from_filter_xyzw", header.get("lab_from_imu_xyzw"))
-    if found:
-        links.append((encoder.reference, BODY, {}, named(found)))
-    yield {
-        "transforms": [
-            {
-                "header": encoder.stamped(header["t_s"], parent)[1],
-                "child_frame_id": child,
-                "transform": {"translation": place, "rotation": rotation},
-            }
-            for parent, child, place, rotation in links
-        ]
-    }
-
-
-def true_attitude(_: RosEncoder, packet: Packet) -> Messages:
-    """Attitude of the body."""
-    yield {"quaternion": named(packet.header["lab_from_body_xyzw"])}
-
-
-def camera_attitude(_: RosEncoder, packet: Packet) -> Messages:
-    """Attitude of the camera: of a frame the true mean over its exposure, with which its solution is compared."""
-    found = packet.truth.get("mean_cam_from_ref_xyzw", packet.header.get("cam_from_ref_xyzw"))
-    if found:
-        yield {"quaternion": named(Rotation.from_quat(found).inv().as_quat())}
-
-
 class Topic(NamedTuple):
-    """Name, type and frame (empty: that of the attitudes) of a topic, and the channel and function of its messages."""
+    """Name, type and frame (empty: that of the attitudes) of a topic, and the channel of its messages."""
 
     name: str
     type: str
     frame: str
     channel: str
-    messages: Callable[[RosEncoder, Packet], Messages]
 
     @property
     def definition(self) -> str:
@@ -190,15 +171,15 @@ class Topic(NamedTuple):
 
 ATTITUDE = "geometry_msgs/msg/QuaternionStamped"
 TOPICS = (
-    Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", CAMERA, "frame", camera_info),
-    Topic("/camera/image_raw", "sensor_msgs/msg/Image", CAMERA, "frame", image),
-    Topic("/imu/data_raw", "sensor_msgs/msg/Imu", BODY, "imu", imu),
-    Topic("/star_tracker/attitude", ATTITUDE, "", "solution", camera_attitude),
-    Topic("/tf", "tf2_msgs/msg/TFMessage", "", "telemetry", transforms),
+    Topic("/camera/camera_info", "sensor_msgs/msg/CameraInfo", CAMERA, "frame"),
+    Topic("/camera/image_raw", "sensor_msgs/msg/Image", CAMERA, "frame"),
+    Topic("/imu/data_raw", "sensor_msgs/msg/Imu", BODY, "imu"),
+    Topic("/star_tracker/attitude", ATTITUDE, "", "solution"),
+    Topic("/tf", "tf2_msgs/msg/TFMessage", "", "telemetry"),
 )
 TRUE_TOPICS = (
-    Topic("/truth/camera", ATTITUDE, "", "frame", camera_attitude),
-    Topic("/truth/attitude", ATTITUDE, "", "truth", true_attitude),
+    Topic("/truth/camera", ATTITUDE, "", "frame"),
+    Topic("/truth/attitude", ATTITUDE, "", "truth"),
 )
 
 

@@ -128,4 +128,4 @@ def read(path: Path) -> Paper:
     try:
         return Paper.model_validate(tree)
     except ValidationError as error:
-        raise explain(error, Paper, tree, [(path, text)], {}) from error
+        raise explain(error, tree, [(path, text)], {}) from error

@@ -608,7 +608,7 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
         return TrialSection.model_validate(tree).trial
     except ValidationError as error:
         # One line without file and line number; the caller adds the factor.
-        raise explain(error, TrialSection, tree, [(Path(), "")], {}).at(None) from None
+        raise explain(error, tree, [(Path(), "")], {}).at(None) from None
 
 
 class TrialSection(ConfigModel):

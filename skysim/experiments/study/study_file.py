@@ -120,7 +120,7 @@ def plan_of(
     try:
         study = Study.model_validate(tree)
     except ValidationError as error:
-        raise explain(error, Study, tree, [(path, text)], overrides or {}) from None
+        raise explain(error, tree, [(path, text)], overrides or {}) from None
     try:
         plan = make_plan(base or path, study, tree["trial"], programs or {}, text)
         check(plan, to_run=programs is not None)

@@ -10,7 +10,6 @@ tape with a driver chip at each LED.
 import csv
 import io
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +21,7 @@ from skysim.core.text import excerpt, read_lines
 from skysim.core.types import Floats, Ints
 from skysim.core.yaml_reader import suggestion
 from skysim.scene.scene import Scene
-from skysim.scene.sections.layouts import HOLES, LcdConfig, StringConfig
+from skysim.scene.sections.layouts import HOLES, LcdConfig, PatchBoardsConfig, StringConfig
 from skysim.scene.sections.leds import PwmConfig, SequentialConfig
 from skysim.sources.dome.layouts.led_list import design_leds, max_tilt_deg
 from skysim.sources.dome.layouts.placing import tilts_rad
@@ -303,8 +302,7 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
     if not isinstance(layout, LcdConfig):
         shell = SHELLS.get(design.light.surface.kind, "shell")
         found = {shell: cap_area_m2(design.surface, design.cap_deg)}
-        found |= MOUNTED.get(layout.kind, single_leds)(design)
-        found |= electronics(design) | {"power_supply": leds}
+        found |= mounted(design) | {"power_supply": leds}
     if design.light.led.code and design.light.led.code.bit_time_s == "frame":
         found["trigger"] = 1
     survey = scene.tracker.survey
@@ -315,41 +313,35 @@ def quantities(scene: Scene, prices: Prices) -> Quantities:
     return found
 
 
-def single_leds(design: DomeDesign) -> Quantities:
-    """LEDs one by one, each in its hole, or at the rim with a fiber to its hole."""
-    count = len(design.leds)
-    line = "fiber" if design.light.layout.kind == "fibers" else "wire"
-    length_m = float(design.to_rim_m(design.led_m).sum())
-    return {"led": count, "mounting_led": count, line: length_m}
-
-
-def boards(design: DomeDesign) -> Quantities:
-    """Patch boards; a board's wire goes to its LED next to the rim."""
-    length_m = nearest_m(design.to_rim_m(design.led_m), design.leds.id // HOLES)
-    count = len(length_m)
-    return {
-        "board": count,
-        "led": len(design.leds),
-        "mounting_board": count,
-        "wire": float(length_m.sum()),
-    }
-
-
-def tape(design: DomeDesign) -> Quantities:
-    """LED tape, cut between LEDs: a pitch of it for each, also for those that are covered."""
+def mounted(design: DomeDesign) -> Quantities:
+    """LEDs, boards or tape, with what mounts, connects and drives them."""
     layout = design.light.layout
-    assert isinstance(layout, StringConfig)
-    wound = wind(layout.with_values(pitch_error=0.0, glue_scatter_m=0.0), design.surface)
-    length_m = layout.pitch_m * len(wound.place_m)
-    kind = "tape_addressable" if is_addressable(design) else "tape"
-    wire_m = nearest_m(design.to_rim_m(wound.place_m), wound.tape).sum()
-    return {kind: length_m, "mounting_tape": length_m, "wire": float(wire_m)}
-
-
-MOUNTED: dict[str, Callable[[DomeDesign], Quantities]] = {
-    "patch_boards": boards,
-    "string": tape,
-}
+    led = design.light.led
+    count = len(design.leds)
+    match layout:
+        case StringConfig():
+            # Cut between LEDs: a pitch of it for each, also for those that are covered.
+            wound = wind(
+                layout.with_values(pitch_error=0.0, glue_scatter_m=0.0), design.surface
+            )
+            tape_m = layout.pitch_m * len(wound.place_m)
+            wire_m = nearest_m(design.to_rim_m(wound.place_m), wound.tape).sum()
+            found = {"mounting_tape": tape_m, "wire": float(wire_m)}
+            # LEDs that differ in brightness, or in time, need a driver each.
+            if led.code or led.drive.kind != "direct" or len(set(layout.dimming)) > 1:
+                return {"tape_addressable": tape_m, **found, "tape_controller": count}
+            return {"tape": tape_m, **found}
+        case PatchBoardsConfig():
+            # A board's wire goes to its LED next to the rim.
+            length_m = nearest_m(design.to_rim_m(design.led_m), design.leds.id // HOLES)
+            boards = len(length_m)
+            found = {"board": boards, "led": count, "mounting_board": boards}
+        case _:
+            # One by one, each in its hole, or at the rim with a fiber to its hole.
+            length_m = design.to_rim_m(design.led_m)
+            found = {"led": count, "mounting_led": count}
+    line = "fiber" if layout.kind == "fibers" else "wire"
+    return {**found, line: float(length_m.sum()), **electronics(design)}
 
 
 def nearest_m(length_m: Floats, group: Ints) -> Floats:
@@ -357,20 +349,10 @@ def nearest_m(length_m: Floats, group: Ints) -> Floats:
     return np.array([length_m[group == one].min() for one in np.unique(group)]).clip(0)
 
 
-def is_addressable(design: DomeDesign) -> bool:
-    """Whether the LEDs of a tape need a driver each: they differ in brightness, or in time."""
-    layout = design.light.layout
-    led = design.light.led
-    assert isinstance(layout, StringConfig)
-    return led.code is not None or led.drive.kind != "direct" or len(set(layout.dimming)) > 1
-
-
 def electronics(design: DomeDesign) -> Quantities:
-    """What drives the LEDs: by the drive, the code and the layout."""
+    """What drives LEDs that are not on tape: by the drive and the code."""
     led = design.light.led
     count = float(len(design.leds))
-    if isinstance(design.light.layout, StringConfig):
-        return {"tape_controller": count} if is_addressable(design) else {}
     if isinstance(led.drive, SequentialConfig):
         return {"resistor": count, "sequencer": len(np.unique(design.leds.clock))}
     if led.drive.kind == "direct" and led.code is None:

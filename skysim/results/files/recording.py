@@ -30,6 +30,7 @@ from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
+Attitudes = tuple[NDArray[Any], Rotation] | None  # (K,) frames or times, and their attitudes
 
 
 class FrameTruth(NamedTuple):
@@ -109,7 +110,7 @@ class Recording:
 
     def _attitudes(
         self, name: str, key: str, angles: Sequence[str], is_celestial: bool
-    ) -> tuple[NDArray[Any], Rotation] | None:
+    ) -> Attitudes:
         """(K,) values of a column of a table, and the attitudes of these rows; None without any.
 
         Raises InputError if a column is missing.
@@ -129,7 +130,7 @@ class Recording:
             return None
         return np.asarray(table[key])[valid], attitudes(angles_deg[valid], is_celestial)
 
-    def solved(self) -> tuple[NDArray[Any], Rotation] | None:
+    def solved(self) -> Attitudes:
         """(K,) indices of the solved frames and their attitudes.
 
         Attitudes are lab_from_cam under the stars and lab_from_body in a laboratory. Returns None if there is no
@@ -138,7 +139,7 @@ class Recording:
         names = CAMERA_ANGLES if self.is_celestial else BODY_ANGLES
         return self._attitudes("solutions", "frame", names, self.is_celestial)
 
-    def motion(self) -> tuple[NDArray[Any], Rotation] | None:
+    def motion(self) -> Attitudes:
         """(K,) times in s and lab_from_body at every tick of the vehicle's computer; None without telemetry.
 
         Raises

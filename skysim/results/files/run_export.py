@@ -3,6 +3,7 @@
 import datetime
 import itertools
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from pathlib import Path
@@ -17,7 +18,7 @@ from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, check_name
 from skysim.core.time import in_utc
-from skysim.core.types import ATTITUDES, Floats, Record
+from skysim.core.types import ATTITUDES, Record
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
@@ -68,28 +69,25 @@ def message(
     for before, after in itertools.pairwise(utc):
         if after <= before:
             raise InputError(name, f"epoch {epoch(after)} is not after {epoch(before)}")
-    head = {
-        "CCSDS_AEM_VERS": "2.0",
-        "CREATION_DATE": epoch(datetime.datetime.now(datetime.UTC)),
-        "ORIGINATOR": ORIGINATOR,
-    }
-    meta = {
-        "OBJECT_NAME": name.upper(),
-        "OBJECT_ID": "UNKNOWN",
-        "REF_FRAME_A": frames[0],
-        "REF_FRAME_B": frames[1],
-        "TIME_SYSTEM": "UTC",
-        "START_TIME": epoch(utc[0]),
-        "STOP_TIME": epoch(utc[-1]),
-        "ATTITUDE_TYPE": "QUATERNION",
-    }
     comments = [*notes, *(f"{frame} = {MEANING[frame]}" for frame in frames)]
-    rows = zip(utc, continuous_quaternions(a_from_b.as_quat()), strict=True)
+    # A continuous sequence, which other tools can interpolate; the first has a scalar part >= 0.
+    xyzw = a_from_b.as_quat()
+    first = -1.0 if xyzw[0, 3] < 0 else 1.0
+    rows = zip(utc, first * continuous(xyzw) + 0.0, strict=True)  # + 0.0 turns -0.0 into 0.0
     lines = [
-        *(f"{key} = {value}" for key, value in head.items()),
+        "CCSDS_AEM_VERS = 2.0",
+        f"CREATION_DATE = {epoch(datetime.datetime.now(datetime.UTC))}",
+        f"ORIGINATOR = {ORIGINATOR}",
         "META_START",
         *(f"COMMENT {text}" for text in comments),
-        *(f"{key} = {value}" for key, value in meta.items()),
+        f"OBJECT_NAME = {name.upper()}",
+        "OBJECT_ID = UNKNOWN",
+        f"REF_FRAME_A = {frames[0]}",
+        f"REF_FRAME_B = {frames[1]}",
+        "TIME_SYSTEM = UTC",
+        f"START_TIME = {epoch(utc[0])}",
+        f"STOP_TIME = {epoch(utc[-1])}",
+        "ATTITUDE_TYPE = QUATERNION",
         "META_STOP",
         "DATA_START",
         *(
@@ -98,27 +96,13 @@ def message(
         ),
         "DATA_STOP",
     ]
-    return "".join(f"{ascii_line(line)}\n" for line in lines)
-
-
-def continuous_quaternions(xyzw: Floats) -> Floats:
-    """(K, 4) the same attitudes as a continuous sequence of quaternions; the first has a scalar part >= 0.
-
-    Other tools can interpolate between them.
-    """
-    first = -1.0 if xyzw[0, 3] < 0 else 1.0
-    return first * continuous(xyzw) + 0.0  # + 0.0 turns -0.0 into 0.0
+    printable = (re.sub("[^ -~]", "?", line) for line in lines)  # no other ASCII is allowed
+    return "".join(f"{line[:MOST_CHARACTERS]}\n" for line in printable)
 
 
 def epoch(utc: datetime.datetime) -> str:
     """Time string of section 6.8.9 of the standard, in UTC: 2012-06-22T21:00:00.120000."""
     return in_utc(utc).isoformat(timespec="microseconds")
-
-
-def ascii_line(line: str) -> str:
-    """The line cut to the allowed length, with characters outside printable ASCII replaced by "?"."""
-    printable = "".join(character if " " <= character <= "~" else "?" for character in line)
-    return printable[:MOST_CHARACTERS]
 
 
 BATCH_ROWS = 1 << 16  # rows buffered before a Parquet row group is written

@@ -97,45 +97,39 @@ def svg_element(shape: Shape) -> str:
             )
 
 
+# A DXF file is of groups of two lines, a code and a value.
+DXF_BEGIN = (
+    "0\nSECTION\n2\nHEADER\n9\n$ACADVER\n1\nAC1009\n"
+    "9\n$INSUNITS\n70\n4\n"  # 4: millimeters
+    "0\nENDSEC\n0\nSECTION\n2\nENTITIES\n"
+)
+DXF_END = "0\nENDSEC\n0\nEOF\n"
+
+
 def to_dxf(drawing: Drawing) -> str:
     """The drawing with 1 drawing unit = 1 mm, the origin at its lower left corner, and a layer for each use."""
-    groups: list[tuple[int, object]] = [
-        (0, "SECTION"),
-        (2, "HEADER"),
-        (9, "$ACADVER"),
-        (1, "AC1009"),
-    ]
-    # 4: millimeters.
-    groups += [(9, "$INSUNITS"), (70, 4), (0, "ENDSEC"), (0, "SECTION"), (2, "ENTITIES")]
-    for shape in drawing.shapes:
-        groups += dxf_groups(shape, drawing.height_mm)
-    groups += [(0, "ENDSEC"), (0, "EOF")]
-    return "".join(
-        f"{code}\n{f'{value:.4f}' if isinstance(value, float) else value}\n"
-        for code, value in groups
-    )
+    elements = (dxf_element(shape, drawing.height_mm) for shape in drawing.shapes)
+    return "".join([DXF_BEGIN, *elements, DXF_END])
 
 
-def dxf_groups(shape: Shape, height_mm: float) -> Iterator[tuple[int, object]]:
-    """The group codes and values of a shape; a dashed line is on a layer of its own."""
-    layer = (8, shape.layer)
+def dxf_element(shape: Shape, height_mm: float) -> str:
+    """The groups of a shape; a dashed line is on a layer of its own."""
     if isinstance(shape, Polyline):
-        layer = (8, "HELP" if shape.dashed else shape.layer)
-        yield from ((0, "POLYLINE"), layer, (66, 1), (70, int(shape.closed)))
-        for x, y in shape.xy_mm.tolist():
-            yield from ((0, "VERTEX"), layer, (10, x), (20, height_mm - y), (30, 0.0))
-        yield from ((0, "SEQEND"), layer)
-        return
-    yield 0, "CIRCLE" if isinstance(shape, Circle) else "TEXT"
-    yield layer
-    yield from ((10, float(shape.x_mm)), (20, float(height_mm - shape.y_mm)), (30, 0.0))
-    if isinstance(shape, Circle):
-        yield 40, float(shape.radius_mm)
-    else:
-        words = "".join(
-            one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words
+        layer = "HELP" if shape.dashed else shape.layer
+        vertices = "".join(
+            f"0\nVERTEX\n8\n{layer}\n{dxf_place(x, height_mm - y)}" for x, y in shape.xy_mm
         )
-        yield from ((40, float(shape.size_mm)), (1, words))
+        head = f"0\nPOLYLINE\n8\n{layer}\n66\n1\n70\n{shape.closed:d}\n"
+        return f"{head}{vertices}0\nSEQEND\n8\n{layer}\n"
+    place = f"8\n{shape.layer}\n{dxf_place(shape.x_mm, height_mm - shape.y_mm)}"
+    if isinstance(shape, Circle):
+        return f"0\nCIRCLE\n{place}40\n{shape.radius_mm:.4f}\n"
+    words = "".join(one if one.isascii() else f"\\U+{ord(one):04X}" for one in shape.words)
+    return f"0\nTEXT\n{place}40\n{shape.size_mm:.4f}\n1\n{words}\n"
+
+
+def dxf_place(x_mm: float, y_mm: float) -> str:
+    return f"10\n{x_mm:.4f}\n20\n{y_mm:.4f}\n30\n0.0000\n"
 
 
 MAX_WIDTH_M = 0.25  # of a gore: at its edge the paper is 0.5 % too long under a dome of 1.2 m
@@ -206,7 +200,8 @@ def gore_count(dome: DomeDesign, widest_m: float = MAX_WIDTH_M) -> int:
 class Gore(NamedTuple):
     """A gore at full scale, its apex up and at the origin, seen from inside the dome; x to the right and y down, mm."""
 
-    outline_mm: Floats
+    half_mm: float  # half of its width
+    length_mm: float  # from the apex
     shapes: list[Shape]
 
 
@@ -221,8 +216,9 @@ def gore(dome: DomeDesign, number: int, count: int) -> Gore:
         1e3 * FROM_INSIDE * on_paper_m(dome.surface, some, meridian_rad)
         for some in (edge, rays[own])
     )
+    half_mm, length_mm = outline_mm.max(axis=0).tolist()
     x_mm, y_mm = outline_mm[0]
-    meridian_mm = np.array([[x_mm, y_mm], [x_mm, outline_mm[:, 1].max()]])
+    meridian_mm = np.array([[x_mm, y_mm], [x_mm, length_mm]])
     title = f"{number + 1}: {math.degrees(meridian_rad):.4g} deg"
     shapes: list[Shape] = [
         Polyline(outline_mm, closed=True),
@@ -230,7 +226,7 @@ def gore(dome: DomeDesign, number: int, count: int) -> Gore:
         SheetText(x_mm - 12, y_mm - 2, 4.0, title),
         *marks(dome.leds.id[own], leds_mm, 1e3 * dome.led_radius_m),
     ]
-    return Gore(outline_mm, shapes)
+    return Gore(half_mm, length_mm, shapes)
 
 
 def moved(shape: Shape, x_mm: float, y_mm: float) -> Shape:
@@ -248,11 +244,10 @@ def gores(dome: DomeDesign) -> Drawing:
     bottom_mm = 0.0
     for number in range(count):
         one = gore(dome, number, count)
-        half_mm = float(one.outline_mm[:, 0].max())
         top_mm = MARGIN_MM + CAPTION_MM
-        shapes += [moved(shape, left_mm + half_mm, top_mm) for shape in one.shapes]
-        left_mm += 2 * half_mm + GAP_MM
-        bottom_mm = max(bottom_mm, top_mm + float(one.outline_mm[:, 1].max()))
+        shapes += [moved(shape, left_mm + one.half_mm, top_mm) for shape in one.shapes]
+        left_mm += 2 * one.half_mm + GAP_MM
+        bottom_mm = max(bottom_mm, top_mm + one.length_mm)
     rule_mm = bottom_mm + CAPTION_MM
     caption = f"{dome.name}: {count} gores, seen from inside, azimuth on top"
     shapes += scale_line(MARGIN_MM, rule_mm, caption)
@@ -373,32 +368,29 @@ class Page(NamedTuple):
 
 
 def pages(dome: DomeDesign, paper: str) -> Iterator[Page]:
-    """The pages of a dome's gores. Raises InputError for an unknown paper."""
+    """The pages of a dome's gores. Raises InputError for an unknown paper.
+
+    On a roll, as many gores side by side as its width has room for; without sheets or a roll, one on a page that is as
+    large as the gore. Such a page is at least as wide as its title.
+    """
     check_name("paper", "paper", paper, PAPERS)
     width_mm, height_mm = SHEETS_MM.get(paper, (math.inf, math.inf))
     count = gore_count(dome, 1e-3 * (width_mm - 2 * MARGIN_MM))
     gores = [gore(dome, number, count) for number in range(count)]
-    if paper not in SHEETS_MM:
-        yield from long_pages(dome.name, gores, ROLL_MM if paper == "roll" else 0.0)
+    if paper in SHEETS_MM:
+        for number, one in enumerate(gores, 1):
+            title = f"{dome.name}: gore {number} of {count}, seen from inside"
+            yield from sheet_pages(title, one, width_mm, height_mm)
         return
-    for number, one in enumerate(gores, 1):
-        title = f"{dome.name}: gore {number} of {count}, seen from inside"
-        yield from sheet_pages(title, one, width_mm, height_mm)
-
-
-def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
-    """As many gores side by side as a page of this width has room for; one on a page that is as large as the gore.
-
-    A page is at least as wide as its title.
-    """
-    half_mm = max(float(one.outline_mm[:, 0].max()) for one in gores)
-    length_mm = max(float(one.outline_mm[:, 1].max()) for one in gores)
+    width_mm = ROLL_MM if paper == "roll" else 0.0
+    half_mm = max(one.half_mm for one in gores)
+    length_mm = max(one.length_mm for one in gores)
     step_mm = 2 * half_mm + GAP_MM
     across = max(1, int((width_mm - 2 * MARGIN_MM + GAP_MM) // step_mm))
     page_mm = max(width_mm, 2 * (half_mm + MARGIN_MM), 1.5 * RULE_MM + 2 * MARGIN_MM)
     # The title of a gore is above its apex.
     height_mm = length_mm + 2 * MARGIN_MM + HEAD_MM + CAPTION_MM
-    for first in range(0, len(gores), across):
+    for first in range(0, count, across):
         some = gores[first : first + across]
         shapes = [
             moved(shape, n * step_mm, 0) for n, one in enumerate(some) for shape in one.shapes
@@ -406,7 +398,7 @@ def long_pages(name: str, gores: list[Gore], width_mm: float) -> Iterator[Page]:
         which = (
             f"gores {first + 1} to {first + len(some)}" if width_mm else f"gore {first + 1}"
         )
-        title = f"{name}: {which} of {len(gores)}, seen from inside"
+        title = f"{dome.name}: {which} of {count}, seen from inside"
         yield Page(page_mm, height_mm, title, (-half_mm, -CAPTION_MM), shapes)
 
 
@@ -415,7 +407,7 @@ def sheet_pages(title: str, one: Gore, width_mm: float, height_mm: float) -> Ite
     half_mm = width_mm / 2 - MARGIN_MM
     shown_mm = height_mm - 2 * MARGIN_MM - HEAD_MM
     step_mm = shown_mm - OVERLAP_MM
-    length_mm = CAPTION_MM + float(one.outline_mm[:, 1].max())
+    length_mm = CAPTION_MM + one.length_mm
     count = max(1, math.ceil((length_mm - OVERLAP_MM) / step_mm))
     tops_mm = [-CAPTION_MM + sheet * step_mm for sheet in range(count)]
     shapes = list(one.shapes)

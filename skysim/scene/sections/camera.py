@@ -27,6 +27,7 @@ from skysim.core.units import (
     Length,
     NotNegative,
     Number,
+    Positive,
     PositiveFraction,
     Seed,
     Several,
@@ -57,6 +58,7 @@ TransferLoss = Annotated[Number, Field(ge=0, le=1e-2)]
 Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
 
 Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
+Column = Several[Annotated[Number, Field(ge=-100, le=100)]] | None
 Distortion = tuple[Radial, Radial, Tangential, Tangential, Radial]
 
 
@@ -166,7 +168,7 @@ class ChromaticConfig(ConfigModel):
 
     wavelength_m: Several[Wavelength]
     focus_m: Several[Annotated[Length, Field(ge=-1e-3, le=1e-3)]] | None = None
-    corner_px: Several[Annotated[Number, Field(ge=-100, le=100)]] | None = None
+    corner_px: Column = None
 
     def check(self) -> None:
         columns = {"focus": self.focus_m, "corner_px": self.corner_px}
@@ -177,9 +179,6 @@ class ChromaticConfig(ConfigModel):
             raise InputError(
                 "", "nothing depends on the wavelength", "focus or corner_px other than 0"
             )
-
-
-Column = Several[Annotated[Number, Field(ge=-100, le=100)]] | None
 
 
 class LensTableConfig(ConfigModel):
@@ -336,7 +335,7 @@ class ParticlesConfig(ConfigModel):
 
     per_cm2_s: Annotated[Number, Field(ge=0, le=1e12)]
     depth_m: Annotated[Length, Field(gt=0, le=1e-3)] = 10e-6
-    electrons_um: Annotated[Number, Field(gt=0, le=1e6)] = 80.0
+    electrons_um: Positive = 80.0
     diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
 
 

@@ -245,7 +245,7 @@ class AgingConfig(ConfigModel):
         hardware_seed
     """
 
-    hours: Annotated[Number, Field(gt=0, le=1e6)]
+    hours: Positive
     life_hours: Annotated[Number, Field(gt=0, le=1e7)]
     scatter: Annotated[NumberError, Field(lt=1), below_one("makes light")] = 0.0
 

@@ -41,6 +41,7 @@ from skysim.core.units import (
     ZeroOrMore,
 )
 from skysim.scene.sections.layouts import (
+    Cap,
     Layout,
     LensDisplayConfig,
     LimitMagnitude,
@@ -111,7 +112,7 @@ class WallConfig(ConfigModel):
 
     thickness_apex_m: PositiveLength
     thickness_base_m: PositiveLength
-    base_deg: Annotated[Number, Field(gt=0, le=90)]
+    base_deg: Cap
     radius_of: Literal["outside", "mid_wall"] = "outside"
     density_kg_m3: Positive | None = None
 
@@ -486,12 +487,14 @@ class LightConfig(ConfigModel):
     ) -> "LightConfig":
         """Validate a section with the class of its `kind` when called on the base class."""
         # As text, because a kind that is a mapping is no key.
-        kind = str(
-            value.get("kind") if cls is LightConfig and isinstance(value, dict) else ""
-        )
+        is_any = cls is LightConfig and isinstance(value, dict) and "kind" in value
+        kind = str(value["kind"]) if is_any else ""
         if kind not in CONFIGS and kind in PLUGINS.entry_points():
             PLUGINS.entry_points()[kind].load()  # the module registers the kind
-        return CONFIGS[kind].model_validate(value) if kind in CONFIGS else handler(value)
+        if kind in CONFIGS:
+            return CONFIGS[kind].model_validate(value)
+        # The other keys of an unknown light are unknown too.
+        return handler({"kind": value["kind"]} if is_any else value)
 
 
 FurtherLight = SerializeAsAny[LightConfig]

@@ -36,6 +36,7 @@ from skysim.core.yaml_reader import ExistingFile
 
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
+Darkness = Annotated[Number, Field(ge=10, le=30)]  # of a sky, mag/arcsec²
 
 
 class HorizonConfig(TableConfig):
@@ -59,7 +60,7 @@ class AirGlowConfig(ConfigModel):
         Whether there is scattered light of the Moon and of the Sun
     """
 
-    dark_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 21.7
+    dark_mag_arcsec2: Darkness = 21.7
     moonlight: bool = True
     twilight: bool = True
 
@@ -288,7 +289,7 @@ class EarthConfig(ConfigModel):
     """
 
     albedo: Fraction = 0.3
-    airglow_mag_arcsec2: Annotated[Number, Field(ge=10, le=30)] = 22.0
+    airglow_mag_arcsec2: Darkness = 22.0
 
 
 class OrbitConfig(ConfigModel):
@@ -319,7 +320,7 @@ class CircularOrbitConfig(OrbitConfig):
 
     kind: Literal["circular"]
     altitude_m: Annotated[Distance, Field(ge=100e3, le=1e9)]
-    inclination_deg: Annotated[Number, Field(ge=0, le=180)]
+    inclination_deg: AxisAngle
     raan_deg: Spin = 0.0
     argument_deg: Spin = 0.0
 
@@ -351,7 +352,7 @@ Orbit = Annotated[CircularOrbitConfig | TleOrbitConfig | OemOrbitConfig, BY_KIND
 # The scene section `background`: glow.
 
 
-ZenithDistance = Annotated[Number, Field(ge=0, lt=90)]
+ZenithDistance = Altitude
 
 
 class UniformGlowConfig(ConfigModel):
@@ -385,7 +386,7 @@ class MoonGlowConfig(ConfigModel):
     kind: Literal["moon"]
     ra_deg: RightAscension
     dec_deg: Declination
-    phase_angle_deg: Annotated[Number, Field(ge=0, le=180)]
+    phase_angle_deg: AxisAngle
     extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
     moon_zenith_deg: ZenithDistance
     field_zenith_deg: ZenithDistance

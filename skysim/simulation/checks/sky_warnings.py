@@ -157,12 +157,12 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
     if not sampled.predicted():
         return math.nan
     for view in sampled.used:
+        if len(view) <= 2:
+            continue
         believed = believed_px2(view, claiming, prnu=0.0)
         try:
-            gain = gains(view, believed) if len(view) > 2 else None
+            gain = gains(view, believed)
         except np.linalg.LinAlgError:
-            gain = None
-        if gain is None:
             continue
         # C, then M.
         places = star_places(view, context)

@@ -244,7 +244,7 @@ def characterize(
     seed
         Seed of the frames of --frames-to.
     """
-    from skysim.experiments.characterize import characterize_camera
+    from skysim.experiments.characterize import characterize_camera, frame_files
 
     config, raw = characterize_camera.read_camera(camera)
     if frames_to is not None:
@@ -252,30 +252,22 @@ def characterize(
             raise InputError(
                 f"--{option}", "has no effect with --frames-to", "one of the two"
             )
-        write_simulated(config, frames_to, seed, json)
+        total = frame_files.frame_count(config.detector)
+        written = frame_files.write_frames(config, frames_to, seed)
+        paths = list(progress(written, total, "rendering"))
+        if json:
+            print_json({"frames": len(paths), "folder": str(frames_to)})
+        else:
+            places = f"--darks {frames_to / 'darks'} --flats {frames_to / 'flats'}"
+            print_wrapped(f"{len(paths)} frames: {places}")
         return
     folders = characterize_camera.check_folders(darks, flats)
     found = characterize_camera.measure_sensor(config, *folders)
     sky = characterize_camera.measure_night(config, raw, night, found) if night else None
     name = Path(camera).stem
-    written = characterize_camera.write_results(
-        output_folder(out, name), config, raw, found, sky, name
-    )
-    print_report(*written, json)
-
-
-def write_simulated(config: Any, folder: Path, seed: int, json: bool) -> None:
-    """Write simulated darks and flats."""
-    from skysim.experiments.characterize import frame_files
-
-    total = frame_files.frame_count(config.detector)
-    paths = list(progress(frame_files.write_frames(config, folder, seed), total, "rendering"))
-    if json:
-        print_json({"frames": len(paths), "folder": str(folder)})
-    else:
-        print_wrapped(
-            f"{len(paths)} frames: --darks {folder / 'darks'} --flats {folder / 'flats'}"
-        )
+    folder = output_folder(out, name)
+    results = characterize_camera.write_results(folder, config, raw, found, sky, name)
+    print_report(*results, json)
 
 
 def complete_camera(incomplete: str) -> list[str]:

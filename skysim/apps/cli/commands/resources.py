@@ -463,7 +463,13 @@ def reproduce(
     if open_ and not report:
         raise InputError("--open", "has no effect without --report", "--report --open")
     if not ids:
-        list_experiments(json)
+        from skysim.experiments.papers.published import experiments
+
+        listed = [
+            {"id": id, "title": published.title, "source": published.source}
+            for id, published in experiments().items()
+        ]
+        print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")
         return
     page = out / "report.html"
     paths = [page_path(path) for path in (page if report else None, markdown) if path]
@@ -490,14 +496,3 @@ def reproduce(
     print_blocks([reproduction.headline(reproductions)])
     for path in paths:
         print(path)
-
-
-def list_experiments(json: bool) -> None:
-    """Print the experiments that can be repeated."""
-    from skysim.experiments.papers.published import experiments
-
-    listed = [
-        {"id": id, "title": published.title, "source": published.source}
-        for id, published in experiments().items()
-    ]
-    print_list(listed, json, lambda entry: f"{entry['id']:20s} {entry['title']}")

@@ -98,7 +98,7 @@ def print_results(
     json: bool,
 ) -> Record:
     """Print the results of the main camera and of the further heads; return the main camera's statistics."""
-    from skysim.results.report import Facts
+    from skysim.results.report import Facts, print_blocks
     from skysim.simulation.checks.facts import TRACKER_KNOWS
 
     (statistics, report), *others = finished
@@ -109,7 +109,7 @@ def print_results(
         terminal.print_json(result | {"heads": head_results} if heads else result)
         return statistics
     known = [(fact.name, fact.lines) for fact in plan.facts if fact.name == TRACKER_KNOWS]
-    terminal.print_blocks([Facts(known)])
+    print_blocks([Facts(known)])
     report.print()
     print(f"report: {statistics['report']}")
     for name, (head, head_report) in heads.items():
@@ -134,18 +134,22 @@ def render(
         Write an 8-bit image of each frame with the truth marked.
     """
     from skysim.results.run import FlightRecorder
-    from skysim.simulation.checks import dome_warnings
+    from skysim.simulation.checks.plan_check import camera_outside_warning
     from skysim.simulation.flight import open_flight
 
     loaded = load(scene, set_, seed, frames)
     folder = output_folder(out, loaded.name)
     with open_flight(loaded) as flight:
-        if warning := dome_warnings.camera_outside_warning(flight.lab):
+        if warning := camera_outside_warning(flight.lab):
             terminal.print_error(warning)
         recorder = FlightRecorder(folder, flight)
         with terminal.progress_callback(loaded.title) as update:
             paths = [
-                str(recorder.of(shot.camera).write(shot.frame, shot.truth, preview))
+                str(
+                    recorder.recorders[shot.camera.name].write(
+                        shot.frame, shot.truth, preview
+                    )
+                )
                 for shot in flight.shots(solves=False, progress=update)
             ]
     if json:

@@ -21,20 +21,20 @@ if TYPE_CHECKING:
     from skysim.apps.live.packets import Output
 
 
-PORTS = {"min": 0, "max": 65535}
+Port = Annotated[int | None, Option(min=0, max=65535)]
 
 
 def live(
     scene: SceneArg,
-    tcp: Annotated[int | None, Option(**PORTS)] = None,
-    http: Annotated[int | None, Option(**PORTS)] = None,
+    tcp: Port = None,
+    http: Port = None,
     gige: bool | None = None,
     folder: Path | None = None,
     display: str | None = None,
-    indi: Annotated[int | None, Option(**PORTS)] = None,
+    indi: Port = None,
     pipe: str | None = None,
     mcap: Path | None = None,
-    foxglove: Annotated[int | None, Option(**PORTS)] = None,
+    foxglove: Port = None,
     host: str = HOST,
     token: str = "",
     truth: bool = False,
@@ -101,9 +101,9 @@ def live(
     from skysim.core import files
     from skysim.simulation.flight import open_flight
 
-    chosen = {name: options[name] for name in OPENERS if options[name] is not None}
+    chosen = {name: options[name] for name in OUTPUTS if options[name] is not None}
     if not chosen:
-        raise InputError("", "no output", ", ".join(f"--{name}" for name in OPENERS))
+        raise InputError("", "no output", ", ".join(f"--{name}" for name in OUTPUTS))
     needs: dict[tuple[str, ...], bool] = {
         (f"--host {host}", "tcp", "http", "gige"): host != HOST,
         ("--token", "tcp", "http"): bool(token),
@@ -183,18 +183,6 @@ class Opening(NamedTuple):
         print(f"skysim live: {text}   (Ctrl-C ends it)", file=sys.stderr, flush=True)
 
 
-def open_folder(opening: Opening, path: Path) -> Output:
-    from skysim.apps.live.packets import Sink, folder_writer
-
-    return Sink("folder", folder_writer(path))
-
-
-def open_pipe(opening: Opening, path: str) -> Output:
-    from skysim.apps.live.packets import Sink, pipe_writer
-
-    return Sink("pipe", pipe_writer(path))
-
-
 def open_http(opening: Opening, port: int) -> Output:
     from skysim.apps.live.http import FrameServer
 
@@ -229,71 +217,61 @@ def shown(live: Live, bench: str) -> Callable[[], DisplayPicture]:
     return show
 
 
-def open_indi(opening: Opening, port: int) -> Output:
-    from skysim.apps.live.indi import IndiCamera
-
-    camera = IndiCamera(opening.live, port)
-    opening.stack.callback(camera.close)
-    opening.say(f"indi {HOST}:{camera.port}")
-    return camera.sink
-
-
-def open_mcap(opening: Opening, path: Path) -> Output:
-    from skysim.apps.live.ros import McapSink, RosEncoder
-
-    return McapSink(RosEncoder(opening.live), path)
-
-
-def open_foxglove(opening: Opening, port: int) -> Output:
-    from skysim.apps.live.ros import FoxgloveSink, RosEncoder
-
-    sink = FoxgloveSink(RosEncoder(opening.live), port)
-    opening.say(f"foxglove ws://{HOST}:{sink.server.port}")
-    return sink
-
-
-def open_tcp(opening: Opening, port: int) -> Output:
-    from skysim.apps.live.wire import WireServer
-
-    token = opening.token
-    server = WireServer(opening.live, opening.host, port, token)
-    opening.say(f"tcp {opening.host}:{server.port}" + (f", token {token}" if token else ""))
-    return server
-
-
-def open_gige(opening: Opening, _: bool) -> Output:
-    from skysim.apps.live.gige import GigeCamera
-
-    camera = GigeCamera(opening.live, opening.host)
-    risk = "" if camera.is_local else ", no token: all that reach it can control it"
-    opening.say(f"gige {camera.host}:{camera.port}{risk}")
-    return camera
-
-
-# By the option's name, in the order in which they are opened.
-OPENERS: dict[str, Callable[[Opening, Any], Output]] = {
-    "folder": open_folder,
-    "pipe": open_pipe,
-    "http": open_http,
-    "gige": open_gige,
-    "indi": open_indi,
-    "mcap": open_mcap,
-    "foxglove": open_foxglove,
-    "tcp": open_tcp,
-}
+# The options of outputs, in the order in which they are opened.
+OUTPUTS = ("folder", "pipe", "http", "gige", "indi", "mcap", "foxglove", "tcp")
 EXTRAS = {"indi": "indi", "mcap": "ros", "foxglove": "ros"}
 TAKE_SOLUTIONS = {"indi", "mcap", "foxglove", "tcp"}
 
 
 def open_output(opening: Opening, name: str, value: Any) -> None:
     """Send the flight's packets to an output, which the stack closes; name the extra that it needs."""
+    from skysim.apps.live import packets
+
+    live, stack, host, token, _ = opening
+    output: Output
     try:
-        output = OPENERS[name](opening, value)
+        match name:
+            case "folder":
+                output = packets.Sink(name, packets.folder_writer(value))
+            case "pipe":
+                output = packets.Sink(name, packets.pipe_writer(value))
+            case "http":
+                output = open_http(opening, value)
+            case "gige":
+                from skysim.apps.live.gige import GigeCamera
+
+                output = GigeCamera(live, host)
+                risk = (
+                    "" if output.is_local else ", no token: all that reach it can control it"
+                )
+                opening.say(f"gige {output.host}:{output.port}{risk}")
+            case "indi":
+                from skysim.apps.live.indi import IndiCamera
+
+                camera = IndiCamera(live, value)
+                stack.callback(camera.close)
+                opening.say(f"indi {HOST}:{camera.port}")
+                output = camera.sink
+            case "mcap":
+                from skysim.apps.live.ros import McapSink, RosEncoder
+
+                output = McapSink(RosEncoder(live), value)
+            case "foxglove":
+                from skysim.apps.live.ros import FoxgloveSink, RosEncoder
+
+                output = FoxgloveSink(RosEncoder(live), value)
+                opening.say(f"foxglove ws://{HOST}:{output.server.port}")
+            case "tcp":
+                from skysim.apps.live.wire import WireServer
+
+                output = WireServer(live, host, value, token)
+                key = f", token {token}" if token else ""
+                opening.say(f"tcp {host}:{output.port}{key}")
     except ModuleNotFoundError as error:
         allowed = f"after pip install 'skysim[{EXTRAS[name]}]'"
         raise InputError(f"--{name}", f"{error.name} is not installed", allowed) from None
-    opening.live.outputs.append(output)
-    opening.stack.callback(output.close)
+    live.outputs.append(output)
+    stack.callback(output.close)
 
 
 def summary(statistics: dict[str, Any]) -> str:

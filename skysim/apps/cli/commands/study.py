@@ -28,21 +28,18 @@ from skysim.apps.cli.terminal import (
     print_error,
     print_json,
     print_replay,
-    print_study_status,
     print_titles,
-    print_worst,
-    study_status,
     trial_progress,
     write_3d_views,
 )
 from skysim.core.errors import InputError, check_name, printable
+from skysim.results.report import print_wrapped
 
 if TYPE_CHECKING:
     from skysim.core.types import Record
     from skysim.experiments.study.execution.engines import Engine
     from skysim.experiments.study.execution.store import Store
     from skysim.experiments.study.plan import Plan
-
 
 app = typer.Typer(
     invoke_without_command=True,
@@ -149,7 +146,15 @@ def status(study: StudyArg, out: Out = None, json: Json = False) -> None:
     if json:
         print_json(progress | {"failures": failures})
         return
-    print_study_status(progress)
+    seconds = progress["seconds"]
+    speed = "its first run has not ended"
+    if seconds:
+        speed = f"{seconds:.1f} s, {progress['done'] / seconds:.2g} trials/s"
+    print_wrapped(
+        f"{progress['title']}: {progress['done']} of {progress['trials']} trials, {progress['failed']} failed,"
+        f" {progress['wrong']} wrong attitudes; {speed}"
+    )
+    print(f"store: {progress['store']} (code {progress['code']})")
     for failure in failures:
         print(f"  trial {failure['trial']}: {printable(failure['error'])}")
 
@@ -267,14 +272,43 @@ def worst(
             for key, text in parse_overrides(where, "where", "FACTOR=LEVEL").items()
         }
         found = analysis.worst_of_levels(plan.study, stored, name, chosen, count)
-    rows = [one._asdict() | {"levels": points[one.point].levels} for one in found]
-    repeat = place.command("replay")
+    rows = [
+        one._asdict()
+        | {
+            "levels": points[one.point].levels,
+            "command": f"{place.command('replay')} {one.trial}",
+        }
+        for one in found
+    ]
     if json:
-        print_json([row | {"command": f"{repeat} {row['trial']}"} for row in rows])
-    else:
+        print_json(rows)
+        return
+    ranked = analysis.ranked(name)
+    if not found:
         instead = f"{place.command('worst')} --response roll_arcsec"
-        levels = [points[one.point].levels for one in found]
-        print_worst(analysis.ranked(name), found, levels, repeat, instead)
+        print(f"no trial counts for {ranked}; rank them by an error: {instead}")
+    for rank, (one, row) in enumerate(zip(found, rows, strict=True), 1):
+        at = ", ".join(f"{factor} = {level}" for factor, level in row["levels"].items())
+        print(
+            f"{rank}. {ranked} {one.value:.4g}: {one.direction}, {one.lights:.0f} lights: {printable(one.event)}"
+            f" ({printable(at)})"
+        )
+        if one.start:
+            print(f"   {one.start}")
+        print(f"   {row['command']}")
+
+
+def study_status(plan: Plan, store: Store) -> Record:
+    """Progress and provenance of a study: trial counts, code version, run time and store."""
+    return {
+        "study": plan.name,
+        "title": plan.study.title,
+        "trials": plan.study.trial_count(len(plan.points)),
+        **store.counts(),
+        "code": store.meta("code"),
+        "seconds": sum(run["seconds"] for run in store.runs()),
+        "store": str(store.path),
+    }
 
 
 # Registered last to be the last in `skysim study --help`.

@@ -32,7 +32,6 @@ from skysim.apps.cli.options import (
     with_location,
 )
 from skysim.apps.cli.terminal import (
-    print_check,
     print_error,
     print_json,
     progress_callback,
@@ -42,8 +41,12 @@ from skysim.core.constants import DAY_S, EARTH_MU_M3_S2, HOUR_S, JULIAN_YEAR_DAY
 from skysim.core.errors import InputError
 from skysim.results.report import (
     Column,
+    Facts,
+    Items,
     Table,
+    Text,
     page_path,
+    print_blocks,
     print_table,
     print_wrapped,
     text_column,
@@ -126,7 +129,8 @@ def check(
     if json:
         print_json(result._replace(findings=findings).as_dict())
     else:
-        print_check(result.facts, findings)
+        warnings = [Items(findings, tone="warning")] if findings else [Text("no warnings")]
+        print_blocks([Facts([(fact.name, fact.lines) for fact in result.facts]), *warnings])
 
 
 def check_file(path: Path, programs: Mapping[str, str]) -> FileVerdict:
