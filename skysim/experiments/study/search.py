@@ -18,7 +18,7 @@ from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.runner import Progress, Watch, run
 from skysim.experiments.study.execution.store import TIMES, Store
-from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, blank_rows
 from skysim.experiments.study.factors import (
     Distribution,
     Factor,
@@ -432,10 +432,10 @@ def run_candidate(
 def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
     columns = store.point_columns(number)
-    replicates = plan.study.replicates
-    missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
-    job = TrialJob(plan.spec)
-    first = number * replicates
-    segments = (Segment(number, {}, first + k, range(k, k + 1)) for k in missing)
+    each = plan.study.replicates
     error = scene_error(columns)
-    return [job.failed(one, error)._replace(scene=REFUSED) for one in segments]
+    return [
+        row._replace(scene=REFUSED, error=error)
+        for row in blank_rows(plan.spec, Segment(number, {}, number * each, range(each)))
+        if row.replicate not in columns["replicate"]
+    ]

@@ -239,19 +239,16 @@ class TrialJob:
 
     def failed(self, segment: Segment, error: str) -> Row:
         """The row of a trial that repeatedly killed its worker."""
-        replicate = segment.replicates[0]
-        seed = seed_of(self.spec, segment.point, replicate)
-        return Row(
-            segment.first,
-            segment.point,
-            replicate,
-            seed,
-            "",
-            code_version(),
-            FAILED,
-            error,
-            0.0,
-        )
+        return blank_rows(self.spec, segment)[0]._replace(error=error)
+
+
+def blank_rows(spec: TrialSpec, segment: Segment) -> list[Row]:
+    """The rows of a segment's trials before they run: failed, without a scene and an error."""
+    point = segment.point
+    return [
+        Row(trial, point, k, seed_of(spec, point, k), "", code_version(), FAILED, None, 0.0)
+        for trial, k in enumerate(segment.replicates, segment.first)
+    ]
 
 
 def block_size(spec: TrialSpec, segment: Segment) -> int:
@@ -277,20 +274,19 @@ def run_block(spec: TrialSpec, segment: Segment) -> list[Row]:
 
     If one of them raises an exception, each is run alone, and the row of the faulty one stores the exception.
     """
-    numbers = list(enumerate(segment.replicates, segment.first))
-    seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
+    rows = blank_rows(spec, segment)
     scene = ""
-    outcomes = [FAILED] * len(seeds)
+    outcomes = [FAILED] * len(rows)
     error = None
     start_s = time.perf_counter()
     try:
         setup = prepared_setup(spec, segment.settings)
         scene = setup.scene_hash
         start_s = time.perf_counter()
-        outcomes = TRIALS[setup.trial.kind](setup, seeds)
+        outcomes = TRIALS[setup.trial.kind](setup, [row.seed for row in rows])
     except Exception as raised:
         errors.raise_wrapped(raised)
-        if len(seeds) > 1:
+        if len(rows) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one)]
         if isinstance(raised, errors.InputError):
             scene = scene or REFUSED
@@ -298,20 +294,10 @@ def run_block(spec: TrialSpec, segment: Segment) -> list[Row]:
         else:
             # The stored text must not depend on the installation path.
             error = traceback.format_exc().replace(f"{ROOT}/", "")
-    seconds = (time.perf_counter() - start_s) / len(seeds)
+    seconds = (time.perf_counter() - start_s) / len(rows)
     return [
-        Row(
-            trial,
-            segment.point,
-            replicate,
-            seed,
-            scene,
-            code_version(),
-            outcome,
-            error,
-            seconds,
-        )
-        for (trial, replicate), seed, outcome in zip(numbers, seeds, outcomes, strict=True)
+        row._replace(scene=scene, outcome=outcome, error=error, seconds=seconds)
+        for row, outcome in zip(rows, outcomes, strict=True)
     ]
 
 
