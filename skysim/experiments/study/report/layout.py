@@ -5,7 +5,7 @@ no two share a level, so they are not grouped by level but shown as points, with
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -207,31 +207,26 @@ def expected_value(name: str) -> float | None:
 
 def panels(lines: PointRows, search: Search, costs: Mapping[int, float]) -> dict[str, Panel]:
     """One panel per objective, constrained response and cost; by name."""
-    names = dict.fromkeys([*search.responses, "cost"])
-    return {name: panel(name, lines, search, costs) for name in names}
-
-
-def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:
-    """The panel of one response, or of `cost`, over the candidates."""
-    if name == "cost":
-        summaries: list[Any] = [
-            (costs.get(line.point, np.nan), np.nan, np.nan) for line in lines
+    found = {}
+    for name in dict.fromkeys([*search.responses, "cost"]):
+        summaries = [
+            line.responses.get(name, metrics.Summary(costs.get(line.point, np.nan)))[:3]
+            for line in lines
         ]
-    else:
-        summaries = [line.responses[name][:3] for line in lines]
-    bounds = [
-        bound
-        for one in search.constraints
-        if one.response == name
-        for bound in (one.at_least, one.at_most)
-        if bound is not None
-    ]
-    title = label(name)
-    for goal in search.objectives:
-        if goal.response == name:
-            title += f", {goal.better} is better"
-    value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
-    return Panel(title, value, low, high, bounds)
+        bounds = [
+            bound
+            for one in search.constraints
+            if one.response == name
+            for bound in (one.at_least, one.at_most)
+            if bound is not None
+        ]
+        title = label(name)
+        for goal in search.objectives:
+            if goal.response == name:
+                title += f", {goal.better} is better"
+        value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
+        found[name] = Panel(title, value, low, high, bounds)
+    return found
 
 
 # Captions.
