@@ -106,7 +106,7 @@ class Candidate(NamedTuple):
     Attributes
     ----------
     figures
-        Statistic of each response that is an objective or a constraint
+        Statistic of each response that is an objective or a constraint, and the cost
     feasible
         Whether all constraints hold for the values (intervals are ignored), and none is missing
     refused
@@ -202,13 +202,13 @@ def evaluate_candidate(
         name: metrics.response(name)(columns) for name in config.responses if name != COST
     }
     price, unpriced = cost(plan, point)
-    values = {name: figure.value for name, figure in figures.items()} | {COST: price}
-    objectives = tuple(values[one.response] for one in config.objectives)
-    violated = [
-        one.response for one in config.constraints if violation(one, values[one.response]) > 0
-    ]
+    figures[COST] = metrics.Summary(price)
+    objectives = tuple(figures[one.response].value for one in config.objectives)
+    violated = [one.response for one in config.constraints if violation(one, figures) > 0]
     violated += [
-        f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])
+        f"no {one.response}"
+        for one in config.objectives
+        if math.isnan(figures[one.response].value)
     ]
     refused = scene_error(columns)
     why = refused or unpriced or ", ".join(violated)
@@ -217,8 +217,9 @@ def evaluate_candidate(
     )
 
 
-def violation(limit: Constraint, value: float) -> float:
+def violation(limit: Constraint, figures: Mapping[str, metrics.Summary]) -> float:
     """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
+    value = figures[limit.response].value
     if math.isnan(value):
         return MISSING_VIOLATION
     bounds = ((limit.at_most, 1), (limit.at_least, -1))
@@ -384,11 +385,8 @@ def report_to_sampler(
 
     A candidate without values gets infinitely bad objectives and an extra violated constraint.
     """
-    values = {name: figure.value for name, figure in candidate.figures.items()} | {
-        COST: candidate.cost
-    }
     for n, limit in enumerate(config.constraints):
-        proposal.set_constraint(str(n), violation(limit, values[limit.response]))
+        proposal.set_constraint(str(n), violation(limit, candidate.figures))
     valid = not candidate.refused and not any(math.isnan(one) for one in candidate.objectives)
     proposal.set_constraint("answered", 0.0 if valid else MISSING_VIOLATION)
     worst = [math.inf if one.better == "less" else -math.inf for one in config.objectives]
