@@ -30,7 +30,6 @@ from skysim.experiments.dome_survey.survey_frames import (
     CalibrationPrior,
     Correspondences,
     SurveyFrame,
-    assumed,
     match_by_imu,
     match_by_survey,
 )
@@ -148,6 +147,16 @@ def survey_in_rounds(
         watch(total, total)
     check_plausible(run, before)
     return run
+
+
+def assumed(prior: CalibrationPrior) -> Assumed:
+    """Lever and focal length before a survey, which enter its adjustment as measurements."""
+    camera = prior.camera
+    uncertainty = prior.uncertainty
+    arm_m = prior.lever.camera_body_m
+    return Assumed(
+        arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
+    )
 
 
 def check_plausible(run: SurveyRun, before: Assumed) -> None:
