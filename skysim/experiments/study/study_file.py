@@ -236,10 +236,9 @@ def check_figures(plan: Plan) -> None:
 
 def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
     """Every figure and threshold with its key in the study file."""
-    for n, figure in enumerate(study.figures):
-        yield f"figures.{n}", figure
-    for n, threshold in enumerate(study.thresholds):
-        yield f"thresholds.{n}", threshold
+    for section in ("figures", "thresholds"):
+        for n, one in enumerate(getattr(study, section)):
+            yield f"{section}.{n}", one
 
 
 def check_hardware(study: Study) -> None:

@@ -466,10 +466,8 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
     """
     trial = setup.trial
     if isinstance(trial, CentroidTrial):
-        frame_trial = FrameTrial(
-            kind="frames",
-            **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")},
-        )
+        attitude = trial.model_dump(include={"tilt_deg", "dec_deg", "near"})
+        frame_trial = FrameTrial(kind="frames", **attitude)
         frame, truth, _ = render_trial_frame(setup._replace(trial=frame_trial), seed)
         return (
             frame,

@@ -139,11 +139,11 @@ def series(lines: PointTable, figure: Curve) -> list[Series]:
             continue
         ordered = sorted(group, key=x_axis.at)
         x = np.array(list(map(x_axis.at, ordered)))
-        summaries = [line.responses[figure.y] for line in ordered]
-        value, low, high = np.array([one[:3] for one in summaries], dtype=float).T
-        count = np.array([one.trials for one in summaries])
+        value, low, high, count, _ = np.array(
+            [line.responses[figure.y] for line in ordered]
+        ).T
         few = np.array([has_few_values(line, figure.y) for line in ordered])
-        found.append(Series(name, x, value, low, high, count, few))
+        found.append(Series(name, x, value, low, high, count.astype(int), few))
     return found
 
 
