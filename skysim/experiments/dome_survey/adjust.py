@@ -232,7 +232,7 @@ def rematched(run: SurveyRun) -> tuple[Matches, CalibrationPrior]:
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
         row: frame
-        for row, frame, ok in zip(run.matches, run.frames, survey.tied, strict=True)
+        for row, (frame, _), ok in zip(run.matches, run.pairs, survey.tied, strict=True)
         if ok
     }
     matches = {}
