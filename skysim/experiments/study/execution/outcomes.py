@@ -343,16 +343,16 @@ def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], 
 def directions(lab: Lab, lab_from_body: Floats, cam_from_lab: Floats) -> dict[str, float]:
     """The columns DIRECTION of an attitude."""
     values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
-    z = np.array([0.0, 0.0, 1.0])
-    if lab.scene.dome:
-        x, y, z_lab = quaternion.apply(lab_from_body, z).tolist()
-        values["body_tilt_deg"] = math.degrees(math.atan2(math.hypot(x, y), z_lab))
-        values["body_azimuth_deg"] = math.degrees(math.atan2(y, x)) % 360
-    else:
-        x, y, z_lab = quaternion.apply(quaternion.inverse(cam_from_lab), z).tolist()
-        values["boresight_ra_deg"] = math.degrees(math.atan2(y, x)) % 360
-        values["boresight_dec_deg"] = math.degrees(math.atan2(z_lab, math.hypot(x, y)))
-    return values
+    dome = lab.scene.dome
+    turn = lab_from_body if dome else quaternion.inverse(cam_from_lab)
+    x, y, z = quaternion.apply(turn, np.array([0.0, 0.0, 1.0])).tolist()
+    around_deg = math.degrees(math.atan2(y, x)) % 360
+    across = math.hypot(x, y)
+    if dome:
+        tilt_deg = math.degrees(math.atan2(across, z))
+        return values | {"body_tilt_deg": tilt_deg, "body_azimuth_deg": around_deg}
+    dec_deg = math.degrees(math.atan2(z, across))
+    return values | {"boresight_ra_deg": around_deg, "boresight_dec_deg": dec_deg}
 
 
 # Flights.
