@@ -43,8 +43,12 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
 from skysim.core.types import Floats, Ints, Record, normalized
-from skysim.experiments.dome_survey import survey_procedure
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
+from skysim.experiments.dome_survey.survey_procedure import (
+    ATTITUDES,
+    pixels_of,
+    read_attitudes,
+)
 from skysim.results.plots import INK, png
 from skysim.results.report import (
     Column,
@@ -165,12 +169,11 @@ def measure_scene(
 def measure_folder(folder: Path, scene: Scene) -> tuple[CalibrationPrior, list[HeldFrame]]:
     """Measure the images of a folder with the IMU's attitudes in its `attitudes.csv`. Raises InputError."""
     known = assumed(build_lab(scene))
-    attitudes = survey_procedure.read_attitudes(folder / survey_procedure.ATTITUDES)
-    frames = []
-    for name, lab_from_body in attitudes.items():
-        pixels = survey_procedure.pixels_of(folder / name, known.camera)
-        frames.append(HeldFrame(lab_from_body, *measure(pixels, scene)))
-    return known, frames
+    attitudes = read_attitudes(folder / ATTITUDES)
+    return known, [
+        HeldFrame(lab_from_body, *measure(pixels_of(folder / name, known.camera), scene))
+        for name, lab_from_body in attitudes.items()
+    ]
 
 
 def sightings(known: CalibrationPrior, frames: Sequence[HeldFrame]) -> Iterator[Sighting]:

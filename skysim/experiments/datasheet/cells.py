@@ -338,8 +338,9 @@ class Designer:
         }
         for key, values in motions.items():
             for value in values:
-                change = {"trial.tracked": TRACKED}
-                yield from self.pair(f"tracked {key}", f"trial.{key}", value, change)
+                yield from self.pair(
+                    f"tracked {key}", f"trial.{key}", value, {"trial.tracked": TRACKED}
+                )
 
     def magnitudes(self) -> Cells:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""

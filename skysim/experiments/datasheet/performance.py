@@ -105,10 +105,13 @@ def consistency(sheet: MeasuredFrames) -> Record:
     rows = sheet.rows("sky")
     right = sheet.right(rows)
     nees = sheet.columns["nees"][rows][right]
-    within = []
-    for level in LEVELS:
-        hits = int(np.sum(nees <= chdtri(3, 1 - level)))
-        within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
+    within = [
+        {
+            "level": level,
+            "share": metrics.proportion(np.sum(nees <= chdtri(3, 1 - level)), nees.size),
+        }
+        for level in LEVELS
+    ]
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
         "nees": mean_nees(sheet, rows),

@@ -375,7 +375,7 @@ class Store:
                 default=point,
             )
             near = range(point, last + 1)
-            rows = self._rows(ranges_of(range(point, last + 1), self._replicates()))
+            rows = self._rows(ranges_of(near, self._replicates()))
             self._near = near, rows
         if len(near) == 1:
             return rows

@@ -174,12 +174,9 @@ def limits(
     """
     if share and not log:
         return -0.03, 1.03
-    inner, outer = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, bounds))
-    inner = inner[np.isfinite(inner)]
-    outer = outer[np.isfinite(outer)]
+    both = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, bounds))
+    inner, outer = (one[np.isfinite(one) & ((one > 0) | (not log))] for one in both)
     if log:
-        inner = inner[inner > 0]
-        outer = outer[outer > 0]
         outer = outer[
             outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR_RATIO
         ]
