@@ -90,13 +90,6 @@ def names_in(code: CodeType) -> set[str]:
     return set(code.co_names).union(*inner)
 
 
-def digests_of(programs: Programs) -> dict[str, str]:
-    """The digests of the functions and objects among external trackers and controllers, by name."""
-    return {
-        name: digest_of(one) for name, one in programs.items() if not isinstance(one, str)
-    }
-
-
 def unsendable(programs: Programs) -> str:
     """The reason why other processes cannot take functions and objects; empty if they can."""
     for name, one in programs.items():

@@ -31,7 +31,7 @@ from skysim.experiments.study.factors import (
     each_level,
     points,
 )
-from skysim.experiments.study.own_code import digests_of
+from skysim.experiments.study.own_code import digest_of
 from skysim.experiments.study.plan import (
     TRIAL,
     AttitudeRange,
@@ -145,7 +145,7 @@ def make_plan(path: Path, study: Study, trial: Tree, programs: Programs, text: s
         study.paired,
         study.hardware,
         dict(programs),
-        digests_of(programs),
+        {name: digest_of(one) for name, one in programs.items() if not isinstance(one, str)},
     )
     if study.optimize is None:
         chosen = points(study.design, study.factors, study.seed)
