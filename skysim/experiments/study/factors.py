@@ -11,7 +11,7 @@ import inspect
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -266,7 +266,7 @@ class Design(ConfigModel):
 
 
 Factors = Mapping[str, Factor]
-Points = Iterator[Point]
+Options = Iterable[Iterable[Option]]  # a level of each factor, for some points
 
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
@@ -296,7 +296,15 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
     totals = {"factorial": levels, "saltelli": count * (len(factors) + 2)}
     if (total := totals.get(design.kind, 0)) > MAX_POINTS:
         raise InputError("design", f"{design.kind} of {total} points", f"up to {MAX_POINTS}")
-    return list(DESIGNS[design.kind](design, factors, seed))
+    chosen: Options = (
+        (
+            [factor.value_at(u) for factor, u in zip(factors.values(), row, strict=True)]
+            for row in unit_cube(design.kind, count, len(factors), seed).tolist()
+        )
+        if sampled
+        else combinations(design.kind, factors)
+    )
+    return [make_point(dict(zip(factors, one, strict=True))) for one in chosen]
 
 
 def make_point(chosen: Mapping[str, Option]) -> Point:
@@ -322,61 +330,30 @@ def each_level(factors: Factors) -> Iterator[tuple[str, Value, Settings, Setting
             yield name, *option, make_point(others | {name: option}).settings
 
 
-def factorial(design: Design, factors: Factors, seed: int) -> Points:
-    """Every combination; the last factor changes fastest."""
-    for levels in itertools.product(*(factor.options() for factor in factors.values())):
-        yield make_point(dict(zip(factors, levels, strict=True)))
+def combinations(kind: str, factors: Factors) -> Options:
+    """Every combination, of which the last factor changes fastest; or the first levels, then each other level alone."""
+    levels = [factor.options() for factor in factors.values()]
+    if kind == "factorial":
+        return itertools.product(*levels)
+    first = [one[0] for one in levels]
+    others = [
+        [*first[:n], level, *first[n + 1 :]]
+        for n, one in enumerate(levels)
+        for level in one[1:]
+    ]
+    return [first, *others]
 
 
-def one_at_a_time(design: Design, factors: Factors, seed: int) -> Points:
-    """The first level of every factor; then each other level of each factor alone."""
-    first = {name: factor.options()[0] for name, factor in factors.items()}
-    yield make_point(first)
-    for name, factor in factors.items():
-        for level in factor.options()[1:]:
-            yield make_point(first | {name: level})
+def unit_cube(kind: str, count: int, width: int, seed: int) -> Floats:
+    """(P, D) points of a Latin hypercube, a Sobol sequence, or the sample for Sobol indices, scrambled by the seed.
 
-
-def points_at(factors: Factors, coordinates: Floats) -> Points:
-    """The points at (P, D) coordinates in the unit cube."""
-    for row in coordinates.tolist():
-        yield make_point(
-            {name: factors[name].value_at(u) for name, u in zip(factors, row, strict=True)}
-        )
-
-
-def sample(design: Design, factors: Factors, seed: int) -> Points:
-    """A Latin hypercube or a Sobol sequence, scrambled by the seed.
-
-    In a Latin hypercube each factor's range is divided into as many strips as points, with one point in each.
+    In a Latin hypercube each axis is divided into as many strips as points, with one point in each. The sample for
+    Sobol indices is A, B, then for each axis A with its column replaced by B's; `table.response_indices` relies on this
+    order. A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
     """
-    qmc = scipy.stats.qmc
-    sampler = (qmc.LatinHypercube if design.kind == "lhs" else qmc.Sobol)(
-        len(factors), rng=seed
-    )
-    yield from points_at(factors, sampler.random(design.points or 0))
-
-
-def saltelli(design: Design, factors: Factors, seed: int) -> Points:
-    """A, B, then for each factor A with its column replaced by B's. `table.response_indices` relies on this order.
-
-    A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
-    """
-    count = design.points or 0
-    width = len(factors)
-    coordinates = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
-    a = coordinates[:, :width]
-    b = coordinates[:, width:]
-    yield from points_at(factors, a)
-    yield from points_at(factors, b)
-    for n in range(width):
-        yield from points_at(factors, np.where(np.arange(width) == n, b, a))
-
-
-DESIGNS: dict[str, Callable[[Design, Factors, int], Points]] = {
-    "factorial": factorial,
-    "one_at_a_time": one_at_a_time,
-    "lhs": sample,
-    "sobol": sample,
-    "saltelli": saltelli,
-}
+    if kind == "lhs":
+        return scipy.stats.qmc.LatinHypercube(width, rng=seed).random(count)
+    if kind == "sobol":
+        return scipy.stats.qmc.Sobol(width, rng=seed).random(count)
+    a, b = np.hsplit(scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count), 2)
+    return np.concatenate([a, b, *(np.where(row, b, a) for row in np.eye(width, dtype=bool))])
