@@ -81,9 +81,9 @@ class KeyedFactor(ConfigModel):
         if (self.key is None) == (not self.keys):
             raise InputError("", "a factor needs either key or keys")
 
-    def settings_for(self, value: Value) -> Settings:
-        """Settings that give every key this value."""
-        return dict.fromkeys(self.keys or (self.key or "",), value)
+    def option(self, value: Value) -> Option:
+        """A value, and the settings that give it to every key."""
+        return value, dict.fromkeys(self.keys or (self.key or "",), value)
 
 
 class Values(KeyedFactor):
@@ -94,7 +94,7 @@ class Values(KeyedFactor):
 
     def options(self) -> list[Option]:
         """Every value with its settings."""
-        return [(value, self.settings_for(value)) for value in self.values]
+        return list(map(self.option, self.values))
 
 
 class Range(KeyedFactor):
@@ -133,8 +133,7 @@ class Range(KeyedFactor):
         """The value at the fraction u of the way from `from` to `to`."""
         (low, unit), (high, _) = split_quantity(self.from_), split_quantity(self.to)
         number = low * (high / low) ** u if self.scale == "log" else low + (high - low) * u
-        value = join_quantity(round(number) if self.integer else number, unit)
-        return value, self.settings_for(value)
+        return self.option(join_quantity(round(number) if self.integer else number, unit))
 
 
 class Distribution(KeyedFactor):
@@ -192,8 +191,8 @@ class Distribution(KeyedFactor):
     def value_at(self, u: float) -> Option:
         """The quantile at probability u."""
         parameters, unit = self.parameters()
-        value = join_quantity(float(QUANTILES[self.distribution](u, *parameters)), unit)
-        return value, self.settings_for(value)
+        quantile = float(QUANTILES[self.distribution](u, *parameters))
+        return self.option(join_quantity(quantile, unit))
 
 
 ALL_PARAMETERS = ("mean", "median", "sigma", "low", "mode", "high")
