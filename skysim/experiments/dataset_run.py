@@ -139,8 +139,8 @@ class DatasetPlan:
 
 def keys_of(factor: Factor) -> set[str]:
     """The keys that a factor sets."""
-    options = [settings for _, settings in factor.options()] or [factor.value_at(0.5)[1]]
-    return {key for settings in options for key in settings}
+    options = factor.options() or [factor.value_at(0.5)]
+    return {key for _, settings in options for key in settings}
 
 
 def load(

@@ -211,9 +211,7 @@ def options(factor: Factor) -> list[Option]:
     """The levels of a factor, the ends of a range, or the median of a distribution."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
-    return (
-        [factor.value_at(0.5)] if isinstance(factor, Distribution) else list(factor.options())
-    )
+    return factor.options() or [factor.value_at(0.5)]
 
 
 # The table.
