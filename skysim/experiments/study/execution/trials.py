@@ -428,9 +428,10 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
     near = attitudes.near
+    under_dome = lab.scene.dome is not None
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
-    if lab.scene.dome:
+    if under_dome:
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         ends = math.cos(math.radians(high)), math.cos(math.radians(low))
@@ -440,11 +441,12 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
             high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
         ends = math.sin(low), math.sin(high)
     zeniths = [math.acos(min(max(rng.uniform(*ends), -1.0), 1.0)) for rng in rngs]
-    angles = [(*turn, zenith) for turn, zenith in zip(turns, zeniths, strict=True)]
-    if lab.scene.dome:
-        drawn = [zyz(first, tilt, last - first) for first, last, tilt in angles]
-    else:
-        drawn = [zyz(first, zenith, last) for first, last, zenith in angles]
+    # Under a dome the second turn is the yaw, which contains that of the tilt.
+    drawn = [
+        zyz(first, zenith, last - first * under_dome)
+        for (first, last), zenith in zip(turns, zeniths, strict=True)
+    ]
+    if not under_dome:
         if near:
             lab_from_pole = lab_from_body_pole(near.body, lab.scene)
             drawn = [quaternion.multiply(lab_from_pole, each) for each in drawn]
