@@ -408,8 +408,11 @@ def replay(
     (row,) = run_block(plan.spec, segment)
     reasons: list[str] = []
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
-    now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
-    changed = [name for name, value in now.items() if stored and stored[name] != value]
+    changed = [
+        name
+        for name in FIELDS
+        if stored and stored[name] != to_sql(getattr(row.outcome, name))
+    ]
     if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         recording.remove_results(make_folder(folder))
