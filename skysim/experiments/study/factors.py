@@ -11,7 +11,7 @@ import inspect
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -235,7 +235,25 @@ Factor = Annotated[
 
 
 MAX_POINTS = 100_000  # which are listed before the first trial
-SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
+
+
+def saltelli(count: int, width: int, seed: int) -> Floats:
+    """A, B, then for each axis A with its column replaced by B's. `table.response_indices` relies on this order.
+
+    A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
+    """
+    a, b = np.hsplit(scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count), 2)
+    return np.concatenate([a, b, *(np.where(row, b, a) for row in np.eye(width, dtype=bool))])
+
+
+# (P, D) points in the unit cube of a number of points, of factors, and a seed that scrambles them. In a Latin hypercube
+# each axis is divided into as many strips as points, with one point in each.
+CUBES: dict[str, Callable[[int, int, int], Floats]] = {
+    "lhs": lambda n, width, seed: scipy.stats.qmc.LatinHypercube(width, rng=seed).random(n),
+    "sobol": lambda n, width, seed: scipy.stats.qmc.Sobol(width, rng=seed).random(n),
+    "saltelli": saltelli,
+}
+SAMPLED_DESIGNS = tuple(CUBES)  # designs in which no two points share a level
 
 
 class Point(NamedTuple):
@@ -265,7 +283,23 @@ class Design(ConfigModel):
 
 
 Factors = Mapping[str, Factor]
-Options = Iterable[Iterable[Option]]  # a level of each factor, for some points
+Options = Iterable[Sequence[Option]]  # a level of each factor, for some points
+
+
+def one_at_a_time(levels: list[list[Option]]) -> Options:
+    """The first level of every factor; then each other level of each factor alone."""
+    first = [one[0] for one in levels]
+    yield first
+    for n, one in enumerate(levels):
+        for level in one[1:]:
+            yield [*first[:n], level, *first[n + 1 :]]
+
+
+# Points of the levels of each factor. In a factorial the last factor changes fastest.
+GRIDS: dict[str, Callable[[list[list[Option]]], Options]] = {
+    "factorial": lambda levels: itertools.product(*levels),
+    "one_at_a_time": one_at_a_time,
+}
 
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
@@ -291,17 +325,20 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
                 "design.kind lhs, sobol, saltelli",
             )
     # Counts multiply, so they are checked before the points are made.
-    levels = math.prod(len(factor.options()) for factor in factors.values())
-    totals = {"factorial": levels, "saltelli": count * (len(factors) + 2)}
+    levels = [factor.options() for factor in factors.values()]
+    totals = {
+        "factorial": math.prod(map(len, levels)),
+        "saltelli": count * (len(factors) + 2),
+    }
     if (total := totals.get(design.kind, 0)) > MAX_POINTS:
         raise InputError("design", f"{design.kind} of {total} points", f"up to {MAX_POINTS}")
     chosen: Options = (
         (
             [factor.value_at(u) for factor, u in zip(factors.values(), row, strict=True)]
-            for row in unit_cube(design.kind, count, len(factors), seed).tolist()
+            for row in CUBES[design.kind](count, len(factors), seed).tolist()
         )
         if sampled
-        else combinations(design.kind, factors)
+        else GRIDS[design.kind](levels)
     )
     return [make_point(dict(zip(factors, one, strict=True))) for one in chosen]
 
@@ -327,32 +364,3 @@ def each_level(factors: Factors) -> Iterator[tuple[str, Value, Settings, Setting
         others = {other: option for other, option in middle.items() if other != name}
         for option in factor.options() or [middle[name]]:
             yield name, *option, make_point(others | {name: option}).settings
-
-
-def combinations(kind: str, factors: Factors) -> Options:
-    """Every combination, of which the last factor changes fastest; or the first levels, then each other level alone."""
-    levels = [factor.options() for factor in factors.values()]
-    if kind == "factorial":
-        return itertools.product(*levels)
-    first = [one[0] for one in levels]
-    others = [
-        [*first[:n], level, *first[n + 1 :]]
-        for n, one in enumerate(levels)
-        for level in one[1:]
-    ]
-    return [first, *others]
-
-
-def unit_cube(kind: str, count: int, width: int, seed: int) -> Floats:
-    """(P, D) points of a Latin hypercube, a Sobol sequence, or the sample for Sobol indices, scrambled by the seed.
-
-    In a Latin hypercube each axis is divided into as many strips as points, with one point in each. The sample for
-    Sobol indices is A, B, then for each axis A with its column replaced by B's; `table.response_indices` relies on this
-    order. A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
-    """
-    if kind == "lhs":
-        return scipy.stats.qmc.LatinHypercube(width, rng=seed).random(count)
-    if kind == "sobol":
-        return scipy.stats.qmc.Sobol(width, rng=seed).random(count)
-    a, b = np.hsplit(scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count), 2)
-    return np.concatenate([a, b, *(np.where(row, b, a) for row in np.eye(width, dtype=bool))])
