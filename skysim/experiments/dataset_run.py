@@ -146,8 +146,8 @@ class DatasetPlan:
 
 def keys_of(factor: Factor) -> set[str]:
     """The keys that a factor sets."""
-    options = [settings for _, settings in factor.options()] or [factor.value_at(0.5)[1]]
-    return {key for settings in options for key in settings}
+    options = factor.options() or [factor.value_at(0.5)]
+    return {key for _, settings in options for key in settings}
 
 
 def load(
@@ -292,17 +292,18 @@ def require_zarr() -> Any:
     return zarr
 
 
-def create_zarr(storage: Storage, frames: int, per_shard: int, image: NDArray) -> None:
-    """Create the array of all images, with the size and type of this one; its shards are those of the dataset."""
+def create_zarr(storage: Storage, plan: DatasetPlan) -> None:
+    """Create the array of all images, with the size and type of the first; its shards are those of the dataset."""
+    image = next(labelled_frames(plan, 0))[3].frame.image_dn
     shape = image.shape
     group = require_zarr().create_group(
         storage.zarr_store(ZARR), zarr_format=3, overwrite=True
     )
     group.create_array(
         ZARR_ARRAY,
-        shape=(frames, *shape),
+        shape=(plan.frames, *shape),
         chunks=(1, *shape),
-        shards=(per_shard, *shape),
+        shards=(plan.frames_per_shard, *shape),
         dtype=image.dtype,
         dimension_names=("frame", "y", "x"),
         attributes={"units": "DN"},
@@ -414,8 +415,7 @@ def prepare(plan: DatasetPlan, storage: Storage) -> None:
     storage.prepare(folders_of(plan))
     # The description of the array is written last.
     if "zarr" in plan.formats and "zarr.json" not in storage.names(f"{ZARR}/{ZARR_ARRAY}"):
-        image = next(labelled_frames(plan, 0))[3].frame.image_dn
-        create_zarr(storage, plan.frames, plan.frames_per_shard, image)
+        create_zarr(storage, plan)
 
 
 def folders_of(plan: DatasetPlan) -> tuple[str, ...]:

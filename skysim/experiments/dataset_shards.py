@@ -3,8 +3,6 @@
 They are a tar of frames and labels (WebDataset), COCO JSON, and Parquet tables.
 """
 
-from __future__ import annotations
-
 import io
 import json
 import math

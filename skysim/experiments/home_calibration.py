@@ -14,7 +14,7 @@ The vehicle is held at several attitudes (stops), and each frame shows the same 
 LEDs are named by the predicted image of the assumed dome at the IMU's attitude, so the truth is not used.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -43,8 +43,12 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
 from skysim.core.types import Floats, Ints, Record, normalized
-from skysim.experiments.dome_survey import survey_procedure
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
+from skysim.experiments.dome_survey.survey_procedure import (
+    ATTITUDES,
+    pixels_of,
+    read_attitudes,
+)
 from skysim.results.plots import INK, png
 from skysim.results.report import (
     Column,
@@ -120,15 +124,18 @@ class HeldFrame(NamedTuple):
     magnitude: Floats
 
 
-def measure(image_dn: NDArray[Any], threshold_dn: float) -> tuple[Floats, Floats]:
+def measure(image_dn: NDArray[Any], scene: Scene) -> tuple[Floats, Floats]:
     """(N, 2) centroids and (N,) magnitudes of the lights of an image (Padro 2012, sections 3.4.1.3 and 3.6.2.1).
 
     As the thesis does with MATLAB's `bwlabel` and `regionprops`, by their counterparts in scikit-image: regions of at
     least 50 connected pixels above the threshold, without a filter, so that noise makes holes in a dim light. The
-    centroid is that of the region's pixels, all with the same weight.
+    centroid is that of the region's pixels, all with the same weight. The threshold is the scene's, a share of the
+    converter's range: 4 % in the thesis (section 3.7).
     """
     from skimage.measure import label, regionprops_table
 
+    range_dn = 2.0**scene.camera.detector.bits - 1
+    threshold_dn = scene.tracker.intensity_threshold * range_dn
     region = label(image_dn > threshold_dn, connectivity=2)
     area_px = np.bincount(region.ravel())
     area_px[0] = 0
@@ -142,20 +149,14 @@ def measure(image_dn: NDArray[Any], threshold_dn: float) -> tuple[Floats, Floats
     return xy_px, instrument_brightness(found["intensity_mean"], found["area"])
 
 
-def intensity_threshold_dn(scene: Scene) -> float:
-    """The scene's intensity threshold, a share of the converter's range: 4 % in the thesis (section 3.7)."""
-    return scene.tracker.intensity_threshold * (2.0**scene.camera.detector.bits - 1)
-
-
 def measure_scene(
     scene: Scene, progress: Progress | None = None
 ) -> tuple[CalibrationPrior, list[HeldFrame]]:
     """Fly a scene and measure its frames. The IMU's attitude is the true one if the vehicle has none."""
     with open_flight(scene) as flight:
         known = assumed(flight.lab)
-        threshold_dn = intensity_threshold_dn(scene)
         measured = [
-            (shot.truth.t_s, *measure(shot.frame.image_dn, threshold_dn))
+            (shot.truth.t_s, *measure(shot.frame.image_dn, scene))
             for shot in flight.shots(solves=False, progress=progress)
             if shot.camera is flight.lab.camera
         ]
@@ -168,13 +169,11 @@ def measure_scene(
 def measure_folder(folder: Path, scene: Scene) -> tuple[CalibrationPrior, list[HeldFrame]]:
     """Measure the images of a folder with the IMU's attitudes in its `attitudes.csv`. Raises InputError."""
     known = assumed(build_lab(scene))
-    threshold_dn = intensity_threshold_dn(scene)
-    attitudes = survey_procedure.read_attitudes(folder / survey_procedure.ATTITUDES)
-    frames = []
-    for name, lab_from_body in attitudes.items():
-        pixels = survey_procedure.pixels_of(folder / name, known.camera)
-        frames.append(HeldFrame(lab_from_body, *measure(pixels, threshold_dn)))
-    return known, frames
+    attitudes = read_attitudes(folder / ATTITUDES)
+    return known, [
+        HeldFrame(lab_from_body, *measure(pixels_of(folder / name, known.camera), scene))
+        for name, lab_from_body in attitudes.items()
+    ]
 
 
 def sightings(known: CalibrationPrior, frames: Sequence[HeldFrame]) -> Iterator[Sighting]:
@@ -377,13 +376,13 @@ def differences(difference_deg: Floats) -> dict[str, list[float]]:
     A single stop has no deviation, NaN.
     """
     absolute = np.abs(difference_deg)
-    columns: dict[str, Callable[..., Any]] = {
-        "least": np.min,
-        "largest": np.max,
-        "mean": np.mean,
-        "sd": deviation,
+    columns = {
+        "least": absolute.min(axis=0),
+        "largest": absolute.max(axis=0),
+        "mean": absolute.mean(axis=0),
+        "sd": deviation(absolute),
     }
-    return {name: of(absolute, axis=0).tolist() for name, of in columns.items()}
+    return {name: one.tolist() for name, one in columns.items()}
 
 
 def spread(found: Calibration, values: Floats) -> Record:
@@ -396,9 +395,9 @@ def moments(values: Floats) -> Record:
     return {"mean": float(values.mean()), "sd": float(deviation(values))}
 
 
-def deviation(values: Floats, axis: int = 0) -> Any:
-    """Standard deviation (n - 1) of the values along an axis; NaN for one."""
-    return values.std(axis=axis, ddof=1) if len(values) > 1 else np.nan * values[0]
+def deviation(values: Floats) -> Any:
+    """Standard deviation (n - 1) of (F, ...) values over the first axis; NaN for one."""
+    return values.std(axis=0, ddof=1) if len(values) > 1 else np.nan * values[0]
 
 
 def calibration_report(

@@ -50,9 +50,7 @@ def test_lights_are_regions_of_fifty_pixels_above_four_percent() -> None:
     image[100:120, 40:60] = 50
     image[150:157, 200:207] = 200
     image[20:60, 200:240] = 10
-    threshold_dn = home.intensity_threshold_dn(load("afit_laboratory"))
-    assert threshold_dn == 0.04 * 255
-    xy_px, magnitude = home.measure(image, threshold_dn)
+    xy_px, magnitude = home.measure(image, load("afit_laboratory"))
     assert xy_px.tolist() == [[44.5, 24.5], [49.5, 109.5]]
     assert magnitude.tolist() == [100 * 100 / 250, 50 * 400 / 250]
 

@@ -1,7 +1,5 @@
 """Frames of the night sky: detection, identification and calibration by the estimator, and the size of star images."""
 
-from __future__ import annotations
-
 import datetime
 import math
 from pathlib import Path

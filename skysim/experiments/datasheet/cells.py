@@ -210,15 +210,6 @@ class Designer:
         turn_deg += attitude * SCAN_PX * self.pixel_deg
         return chosen | {"trial.noise_seed": self.noise, "trial.turn_deg": turn_deg}
 
-    def in_turn(self, number: int) -> Settings:
-        """The settings of a number: another attitude each, with the units and thermal states of the terms in turn.
-
-        The units must be those of the terms: the mean bias of a few other units would be another. The first `states`
-        draws have all thermal states, and the first `states` times `units` all combinations.
-        """
-        turns, state = divmod(number, self.states)
-        return self.settings((turns + state) % self.units, state, 10 + number)
-
     def cells(self) -> Cells:
         """All cells, in the order in which they are run."""
         yield from self.terms()
@@ -232,7 +223,9 @@ class Designer:
             yield DatasheetCell("sky", {"draw": number}, settings)
         yield from self.rates()
         yield from self.sequences()
-        yield from self.accelerations()
+        # Pairs at accelerations, with a rate of zero at mid-exposure.
+        for bend in self.accelerations_deg_s2(BENDS_PX, self.scene.exposure.time_s):
+            yield from self.pair("acceleration", "trial.acceleration_deg_s2", bend)
         yield from self.tracked()
         yield from self.magnitudes()
         pairs = max(self.size.pairs, self.states)
@@ -256,10 +249,16 @@ class Designer:
     def draws(
         self, experiment: str, count: int, change: Settings | None = None, **levels: Any
     ) -> Cells:
-        """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included."""
+        """Frames of other attitudes. With a change they are otherwise equal to those without it, noise included.
+
+        They have the units and thermal states of the terms in turn: the mean bias of a few other units would be
+        another. The first `states` draws have all thermal states, and the first `states` times `units` all
+        combinations.
+        """
         for number in range(count):
-            settings = self.in_turn(number) | {"trial.noise_seed": 10_000 + number}
-            settings |= change or {}
+            turns, state = divmod(number, self.states)
+            settings = self.settings((turns + state) % self.units, state, 10 + number)
+            settings |= {"trial.noise_seed": 10_000 + number} | (change or {})
             if settings.get("trial.kind") == "centroids":
                 del settings["trial.turn_deg"]
             yield DatasheetCell(experiment, {**levels, "draw": number}, settings)
@@ -318,11 +317,6 @@ class Designer:
                 settings = self.settings(turn_deg=turn_deg) | {"trial.rate_deg_s": rate}
                 yield DatasheetCell("sequence", {"rate_deg_s": rate, "step": step}, settings)
 
-    def accelerations(self) -> Cells:
-        """Pairs of frames at accelerations, with a rate of zero at mid-exposure."""
-        for bend in self.accelerations_deg_s2(BENDS_PX, self.scene.exposure.time_s):
-            yield from self.pair("acceleration", "trial.acceleration_deg_s2", bend)
-
     def tracked(self) -> Cells:
         """Pairs of frames in tracking mode, at constant rates and at accelerations; none without the mode.
 
@@ -338,8 +332,9 @@ class Designer:
         }
         for key, values in motions.items():
             for value in values:
-                change = {"trial.tracked": TRACKED}
-                yield from self.pair(f"tracked {key}", f"trial.{key}", value, change)
+                yield from self.pair(
+                    f"tracked {key}", f"trial.{key}", value, {"trial.tracked": TRACKED}
+                )
 
     def magnitudes(self) -> Cells:
         """Pairs of frames with other limits of the tracker's catalog, under the stars."""

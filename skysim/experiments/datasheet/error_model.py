@@ -62,20 +62,20 @@ class ErrorModel:
         linear between the rates
     """
 
-    def __init__(self, constants: dict[str, Any]) -> None:
-        def array(name: str) -> Any:
-            return np.array(constants[name], dtype=float)
+    mean: Any
+    unit: Any
+    thermal: Any
+    field: Any
+    pixel: Any
+    scale: Any
+    rates_deg_s: Any
+    noise: Any
+    along: Any
 
+    def __init__(self, constants: dict[str, Any]) -> None:
         self.constants = constants
-        self.mean = array("mean")
-        self.unit = array("unit")
-        self.thermal = array("thermal")
-        self.field = array("field")
-        self.pixel = array("pixel")
-        self.scale = array("scale")
-        self.rates_deg_s = array("rates_deg_s")
-        self.noise = array("noise")
-        self.along = array("along")
+        for name in ErrorModel.__annotations__:
+            setattr(self, name, np.array(constants[name], dtype=float))
 
     @classmethod
     def read(cls, path: Any) -> ErrorModel:

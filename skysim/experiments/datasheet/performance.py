@@ -105,10 +105,13 @@ def consistency(sheet: MeasuredFrames) -> Record:
     rows = sheet.rows("sky")
     right = sheet.right(rows)
     nees = sheet.columns["nees"][rows][right]
-    within = []
-    for level in LEVELS:
-        hits = int(np.sum(nees <= chdtri(3, 1 - level)))
-        within.append({"level": level, "share": metrics.proportion(hits, nees.size)})
+    within = [
+        {
+            "level": level,
+            "share": metrics.proportion(np.sum(nees <= chdtri(3, 1 - level)), nees.size),
+        }
+        for level in LEVELS
+    ]
     x, y, _ = sheet.errors(rows)[:, right] ** 2
     return {
         "nees": mean_nees(sheet, rows),
@@ -124,7 +127,7 @@ def noise_equivalent_angle(apart: Floats) -> float:
 
 def pair_row(sheet: MeasuredFrames, rows: CellRows) -> Record:
     """Outcomes, temporal noise and rms error about one axis of a pair of cells, arcseconds."""
-    first, second = (sheet.errors([row]) for row in rows[:2])
+    errors = sheet.errors(rows)
     found: Record = {
         "counts": counts(sheet, rows, by_field=True),
         **rms_by_group(sheet, rows),
@@ -132,8 +135,8 @@ def pair_row(sheet: MeasuredFrames, rows: CellRows) -> Record:
         "intervals": {},
     }
     for name, axes in GROUPS.items():
-        apart = first[axes] - second[axes]
-        squares = mean_known(apart**2, (0, 1)) / 2
+        apart = errors[axes, 0] - errors[axes, 1]
+        squares = mean_known(apart**2, 0) / 2
         found[f"nea_{name}"] = noise_equivalent_angle(apart)
         found["intervals"][f"nea_{name}"] = root_interval(squares)
         found["intervals"][f"rms_{name}"] = root_interval(squares_by_field(sheet, rows, axes))

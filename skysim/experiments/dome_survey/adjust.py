@@ -30,7 +30,6 @@ from skysim.experiments.dome_survey.survey_frames import (
     CalibrationPrior,
     Correspondences,
     SurveyFrame,
-    assumed,
     match_by_imu,
     match_by_survey,
 )
@@ -150,6 +149,16 @@ def survey_in_rounds(
     return run
 
 
+def assumed(prior: CalibrationPrior) -> Assumed:
+    """Lever and focal length before a survey, which enter its adjustment as measurements."""
+    camera = prior.camera
+    uncertainty = prior.uncertainty
+    arm_m = prior.lever.camera_body_m
+    return Assumed(
+        arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
+    )
+
+
 def check_plausible(run: SurveyRun, before: Assumed) -> None:
     """Raise InputError if the survey found a focal length or a lever arm that contradicts what was assumed before.
 
@@ -223,7 +232,7 @@ def rematched(run: SurveyRun) -> tuple[Matches, CalibrationPrior]:
     sigma_px = np.hypot(map_px, max(survey.rms_px, prior.floor_px))
     tied = {
         row: frame
-        for row, frame, ok in zip(run.matches, run.frames, survey.tied, strict=True)
+        for row, (frame, _), ok in zip(run.matches, run.pairs, survey.tied, strict=True)
         if ok
     }
     matches = {}

@@ -63,10 +63,17 @@ class SurveyRun:
     prior: CalibrationPrior
 
     @property
-    def frames(self) -> list[SurveyFrame]:
-        """The frames of the survey, with their adjusted attitudes."""
-        pairs = zip(self.matches, self.survey.body_from_lab, strict=True)
-        return [replace(self.taken[row], body_from_lab=attitude) for row, attitude in pairs]
+    def pairs(self) -> list[tuple[SurveyFrame, Correspondences]]:
+        """The frames of the survey with their adjusted attitudes, and the correspondences that were not rejected."""
+        frame, row = self.survey.outliers.T
+        found = zip(self.matches.items(), self.survey.body_from_lab, strict=True)
+        return [
+            (
+                replace(self.taken[number], body_from_lab=attitude),
+                Correspondences(*(np.delete(part, row[frame == k]) for part in match)),
+            )
+            for k, ((number, match), attitude) in enumerate(found)
+        ]
 
     @property
     def held(self) -> HeldFrames:
@@ -75,25 +82,15 @@ class SurveyRun:
         return HeldFrames(survey.camera, survey.leds, survey.lever, survey.body_from_lab)
 
     @property
-    def inliers(self) -> list[Correspondences]:
-        """The correspondences without those that the adjustment rejected."""
-        frame, row = self.survey.outliers.T
-        return [
-            Correspondences(*(np.delete(part, row[frame == k]) for part in match))
-            for k, match in enumerate(self.matches.values())
-        ]
-
-    @property
     def seen(self) -> Bools:
         """(F, N) mask of the LEDs identified in each frame."""
-        return identified(self.inliers, len(self.listed.id))
+        return identified([match for _, match in self.pairs], len(self.listed.id))
 
     @property
     def noise_px(self) -> float:
         """Standard deviation of a centroid's coordinates by the residuals, for the mean information."""
-        pairs = zip(self.frames, self.inliers, strict=True)
         sigma_px = np.concatenate(
-            [frame.lights.sigma_px[match.light] for frame, match in pairs]
+            [frame.lights.sigma_px[match.light] for frame, match in self.pairs]
         )
         return self.survey.noise_scale / math.sqrt(np.mean(sigma_px**-2.0))
 
@@ -137,14 +134,14 @@ def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
 
 def stray_lights(run: SurveyRun) -> list[StrayLight]:
     """Lights at rest in the lab that are not a known LED."""
-    frame = [np.zeros(0, np.int64)]
+    number = [np.zeros(0, np.int64)]
     xy_px = [np.zeros((0, 2))]
-    for k, match in enumerate(run.inliers):
+    for k, (frame, match) in enumerate(run.pairs):
         if run.survey.tied[k]:
-            xy_px.append(np.delete(run.frames[k].lights.xy_px, match.light, axis=0))
-            frame.append(np.full(len(xy_px[-1]), k))
+            xy_px.append(np.delete(frame.lights.xy_px, match.light, axis=0))
+            number.append(np.full(len(xy_px[-1]), k))
     return survey_faults.stray_lights(
-        run.held, np.concatenate(frame), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
+        run.held, np.concatenate(number), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
     )
 
 
@@ -153,7 +150,7 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
     survey = run.survey
     found = [np.zeros((0, 2))]
     residual = [np.zeros((0, 2))]
-    for frame, match, tied in zip(run.frames, run.inliers, survey.tied, strict=True):
+    for (frame, match), tied in zip(run.pairs, survey.tied, strict=True):
         used = survey.surveyed[match.led] & tied
         xy_px = frame.lights.xy_px[match.light[used]]
         place_m = survey.leds.position_m[match.led[used]]
@@ -166,7 +163,7 @@ def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
 
 def light_table(run: SurveyRun) -> LightTable:
     """The light of each LED in the frames, measured and expected."""
-    index = np.array([frame.index for frame in run.frames])
+    index = np.array([frame.index for frame, _ in run.pairs])
     # The margin of the chip includes the errors of the places. Two images do not merge at twice the reach of one.
     margin_px = run.prior.margin_px
     place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
@@ -182,7 +179,7 @@ def light_at_unit_distance(run: SurveyRun) -> Floats:
     out = np.full(run.seen.shape, np.nan)
     survey = run.survey
     camera_m = survey.body_from_lab.inv().apply(survey.lever.camera_body_m)
-    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
+    for k, (frame, match) in enumerate(run.pairs):
         squared_m2 = np.sum((survey.leds.position_m[match.led] - camera_m[k]) ** 2, axis=1)
         out[k, match.led] = np.maximum(frame.lights.flux[match.light], 1e-9) * squared_m2
     return out
@@ -396,7 +393,7 @@ def attitude_rows(run: SurveyRun, names: Sequence[str]) -> list[Record]:
     survey = run.survey
     R_cam_from_body = survey.lever.cam_from_body.as_matrix()
     rows: list[Record] = [{"file": name, "status": "not identified"} for name in names]
-    for k, (frame, match) in enumerate(zip(run.frames, run.inliers, strict=True)):
+    for k, (frame, match) in enumerate(run.pairs):
         row = rows[frame.index]
         row |= {"status": "too few surveyed LEDs", "matches": len(match.led)}
         if survey.tied[k]:

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import survey_plan
-from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.survey_plan import SurveyModel
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -222,16 +221,6 @@ def survey_model(known: CalibrationPrior, noise_px: float) -> SurveyModel:
         uncertainty.fit_distortion,
     )
     return SurveyModel(known.camera, known.leds, known.lever, noise_px, *sigmas)
-
-
-def assumed(prior: CalibrationPrior) -> Assumed:
-    """Lever and focal length before a survey, which enter its adjustment as measurements."""
-    camera = prior.camera
-    uncertainty = prior.uncertainty
-    arm_m = prior.lever.camera_body_m
-    return Assumed(
-        arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
-    )
 
 
 def with_survey_errors(scene: Scene, uncertainty: SurveyUncertainty) -> Scene:

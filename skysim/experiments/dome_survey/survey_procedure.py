@@ -99,7 +99,7 @@ def best_images(folder: Path) -> list[Path]:
 
     def rank(path: Path) -> int:
         suffix = images.image_suffix(path.name)
-        return FORMATS.index(suffix) if suffix in FORMATS else len(FORMATS)
+        return (*FORMATS, suffix).index(suffix)  # others are the last
 
     return [path for _, path in sorted(images.best_images(folder, rank).items())]
 

@@ -321,9 +321,7 @@ def response_range(name: str, lines: PointTable) -> str:
         return f"{name}: no trial has a value."
     (least, low), (most, high) = extremes(name, points)
     if least.responses[name].value == most.responses[name].value:
-        return f"{name}: {low}" + (
-            f" at all {len(points)} points." if len(points) > 1 else "."
-        )
+        return f"{name}: {low}{everywhere(len(points))}."
     return f"{name}: {low} at {lines.place(least)}, to {high} at {lines.place(most)}."
 
 

@@ -2,7 +2,7 @@
 
 A study is a file, or is made in Python:
 
-1. `keys_of` gives the keys of what `run_study` gets; functions and trackers in them become names (own_code.py).
+1. `keys_of` gives the keys of what `run_study` gets; functions and trackers in them become names (`with_names`).
 2. Overrides change them.
 3. `with_part` puts a controller, tracker or profile into them.
 4. The study is checked and run like one of a file, which is written beside the store.
@@ -19,6 +19,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from estimator.trackers.dome_tracker import DomeTracker
+from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.plugins import NO_PROGRAMS, Programs
@@ -35,6 +37,7 @@ from skysim.core.yaml_reader import (
     value_at,
 )
 from skysim.dynamics import profile_samples
+from skysim.dynamics.controllers import CONTROLLERS
 from skysim.experiments.study import own_code, search, study_file, table
 from skysim.experiments.study.execution import runner, store
 from skysim.experiments.study.execution.engines import Engine, Pool, Serial
@@ -45,6 +48,7 @@ from skysim.results.report import Report
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import check_controller, check_tracker, name_of
+from skysim.tracking.tracker_interface import OWN
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -128,10 +132,10 @@ def run_study(
     made = dict(programs)
     parts = {"controller": controller, "tracker": tracker, "profile": profile}
     given = {name: part for name, part in parts.items() if part is not None}
-    changes = own_code.with_names({**(overrides or {}), **keys}, made)
+    changes = with_names({**(overrides or {}), **keys}, made)
     path = study_file.find(str(study)) if isinstance(study, str | Path) else Path(MAPPING)
     # 1. Keys. 2. Overrides.
-    tree = own_code.with_names(keys_of(study, path), made)
+    tree = with_names(keys_of(study, path), made)
     texts = study_texts(changes, tree)
     is_plain = path.name != MAPPING and not given
     if is_plain:
@@ -148,7 +152,7 @@ def run_study(
         # 3. Parts.
         for name, part in given.items():
             with_part(tree, name, part, folder, made)
-        tree, text = as_tree(own_code.with_names(tree, made))
+        tree, text = as_tree(with_names(tree, made))
         plan = study_file.plan_of(tree, text, path.with_name(MAPPING), programs=made)
         plan = replace(plan, path=folder / f"{folder.resolve().name}.yaml")
     # 4. Trials.
@@ -185,8 +189,29 @@ def keys_of(study: Any, path: Path) -> Keys:
         return (
             {**study, "scene": loader.keys_of(scene)} if isinstance(scene, Scene) else study
         )
-    loaded = loader.load(own_code.with_names(study, {}), refuses_unused=False)
+    loaded = loader.load(with_names(study, {}), refuses_unused=False)
     return {"title": loaded.title, "seed": loaded.seed, "scene": study}
+
+
+def with_names(value: Any, programs: dict[str, Any]) -> Any:
+    """A value of a study or a scene with names for functions and trackers in it, which are added to `programs`.
+
+    Raises InputError for two with one name, and for the name of one of skysim's own.
+    """
+    if isinstance(value, Mapping):
+        return {key: with_names(inner, programs) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [with_names(inner, programs) for inner in value]
+    if not (callable(value) or isinstance(value, StarTracker | DomeTracker)):
+        return value
+    return register(name_of(value), value, programs)
+
+
+def register(name: str, part: Any, programs: dict[str, Any]) -> str:
+    """Add a tracker or controller to the programs, and return its name. Raises InputError if that is in use."""
+    if programs.setdefault(name, part) is not part or name in (OWN, *CONTROLLERS.own):
+        raise InputError(name, "name already in use", f"a mapping such as {{'my_{name}': …}}")
+    return name
 
 
 def study_texts(changes: Keys, tree: Keys) -> dict[str, str]:
@@ -220,7 +245,7 @@ def with_part(
         elif name == "controller":
             check_controller(one)
         is_code = name != "profile" and not isinstance(one, str)
-        part = own_code.register(key, one, programs) if is_code else one
+        part = register(key, one, programs) if is_code else one
         levels[str(key)] = part_settings(tree, name, part, folder)
     if not many:
         tree["set"] = tree.get("set", {}) | next(iter(levels.values()))

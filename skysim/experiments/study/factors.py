@@ -11,7 +11,7 @@ import inspect
 import itertools
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
@@ -81,9 +81,9 @@ class KeyedFactor(ConfigModel):
         if (self.key is None) == (not self.keys):
             raise InputError("", "a factor needs either key or keys")
 
-    def settings_for(self, value: Value) -> Settings:
-        """Settings that give every key this value."""
-        return dict.fromkeys(self.keys or (self.key or "",), value)
+    def option(self, value: Value) -> Option:
+        """A value, and the settings that give it to every key."""
+        return value, dict.fromkeys(self.keys or (self.key or "",), value)
 
 
 class Values(KeyedFactor):
@@ -94,7 +94,7 @@ class Values(KeyedFactor):
 
     def options(self) -> list[Option]:
         """Every value with its settings."""
-        return [(value, self.settings_for(value)) for value in self.values]
+        return list(map(self.option, self.values))
 
 
 class Range(KeyedFactor):
@@ -133,8 +133,7 @@ class Range(KeyedFactor):
         """The value at the fraction u of the way from `from` to `to`."""
         (low, unit), (high, _) = split_quantity(self.from_), split_quantity(self.to)
         number = low * (high / low) ** u if self.scale == "log" else low + (high - low) * u
-        value = join_quantity(round(number) if self.integer else number, unit)
-        return value, self.settings_for(value)
+        return self.option(join_quantity(round(number) if self.integer else number, unit))
 
 
 class Distribution(KeyedFactor):
@@ -192,8 +191,8 @@ class Distribution(KeyedFactor):
     def value_at(self, u: float) -> Option:
         """The quantile at probability u."""
         parameters, unit = self.parameters()
-        value = join_quantity(float(QUANTILES[self.distribution](u, *parameters)), unit)
-        return value, self.settings_for(value)
+        quantile = float(QUANTILES[self.distribution](u, *parameters))
+        return self.option(join_quantity(quantile, unit))
 
 
 ALL_PARAMETERS = ("mean", "median", "sigma", "low", "mode", "high")
@@ -236,7 +235,25 @@ Factor = Annotated[
 
 
 MAX_POINTS = 100_000  # which are listed before the first trial
-SAMPLED_DESIGNS = ("lhs", "sobol", "saltelli")  # designs in which no two points share a level
+
+
+def saltelli(count: int, width: int, seed: int) -> Floats:
+    """A, B, then for each axis A with its column replaced by B's. `table.response_indices` relies on this order.
+
+    A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
+    """
+    a, b = np.hsplit(scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count), 2)
+    return np.concatenate([a, b, *(np.where(row, b, a) for row in np.eye(width, dtype=bool))])
+
+
+# (P, D) points in the unit cube of a number of points, of factors, and a seed that scrambles them. In a Latin hypercube
+# each axis is divided into as many strips as points, with one point in each.
+CUBES: dict[str, Callable[[int, int, int], Floats]] = {
+    "lhs": lambda n, width, seed: scipy.stats.qmc.LatinHypercube(width, rng=seed).random(n),
+    "sobol": lambda n, width, seed: scipy.stats.qmc.Sobol(width, rng=seed).random(n),
+    "saltelli": saltelli,
+}
+SAMPLED_DESIGNS = tuple(CUBES)  # designs in which no two points share a level
 
 
 class Point(NamedTuple):
@@ -266,7 +283,23 @@ class Design(ConfigModel):
 
 
 Factors = Mapping[str, Factor]
-Points = Iterator[Point]
+Options = Iterable[Sequence[Option]]  # a level of each factor, for some points
+
+
+def one_at_a_time(levels: list[list[Option]]) -> Options:
+    """The first level of every factor; then each other level of each factor alone."""
+    first = [one[0] for one in levels]
+    yield first
+    for n, one in enumerate(levels):
+        for level in one[1:]:
+            yield [*first[:n], level, *first[n + 1 :]]
+
+
+# Points of the levels of each factor. In a factorial the last factor changes fastest.
+GRIDS: dict[str, Callable[[list[list[Option]]], Options]] = {
+    "factorial": lambda levels: itertools.product(*levels),
+    "one_at_a_time": one_at_a_time,
+}
 
 
 def points(design: Design, factors: Factors, seed: int) -> list[Point]:
@@ -292,11 +325,22 @@ def points(design: Design, factors: Factors, seed: int) -> list[Point]:
                 "design.kind lhs, sobol, saltelli",
             )
     # Counts multiply, so they are checked before the points are made.
-    levels = math.prod(len(factor.options()) for factor in factors.values())
-    totals = {"factorial": levels, "saltelli": count * (len(factors) + 2)}
+    levels = [factor.options() for factor in factors.values()]
+    totals = {
+        "factorial": math.prod(map(len, levels)),
+        "saltelli": count * (len(factors) + 2),
+    }
     if (total := totals.get(design.kind, 0)) > MAX_POINTS:
         raise InputError("design", f"{design.kind} of {total} points", f"up to {MAX_POINTS}")
-    return list(DESIGNS[design.kind](design, factors, seed))
+    chosen: Options = (
+        (
+            [factor.value_at(u) for factor, u in zip(factors.values(), row, strict=True)]
+            for row in CUBES[design.kind](count, len(factors), seed).tolist()
+        )
+        if sampled
+        else GRIDS[design.kind](levels)
+    )
+    return [make_point(dict(zip(factors, one, strict=True))) for one in chosen]
 
 
 def make_point(chosen: Mapping[str, Option]) -> Point:
@@ -320,63 +364,3 @@ def each_level(factors: Factors) -> Iterator[tuple[str, Value, Settings, Setting
         others = {other: option for other, option in middle.items() if other != name}
         for option in factor.options() or [middle[name]]:
             yield name, *option, make_point(others | {name: option}).settings
-
-
-def factorial(design: Design, factors: Factors, seed: int) -> Points:
-    """Every combination; the last factor changes fastest."""
-    for levels in itertools.product(*(factor.options() for factor in factors.values())):
-        yield make_point(dict(zip(factors, levels, strict=True)))
-
-
-def one_at_a_time(design: Design, factors: Factors, seed: int) -> Points:
-    """The first level of every factor; then each other level of each factor alone."""
-    first = {name: factor.options()[0] for name, factor in factors.items()}
-    yield make_point(first)
-    for name, factor in factors.items():
-        for level in factor.options()[1:]:
-            yield make_point(first | {name: level})
-
-
-def points_at(factors: Factors, coordinates: Floats) -> Points:
-    """The points at (P, D) coordinates in the unit cube."""
-    for row in coordinates.tolist():
-        yield make_point(
-            {name: factors[name].value_at(u) for name, u in zip(factors, row, strict=True)}
-        )
-
-
-def sample(design: Design, factors: Factors, seed: int) -> Points:
-    """A Latin hypercube or a Sobol sequence, scrambled by the seed.
-
-    In a Latin hypercube each factor's range is divided into as many strips as points, with one point in each.
-    """
-    qmc = scipy.stats.qmc
-    sampler = (qmc.LatinHypercube if design.kind == "lhs" else qmc.Sobol)(
-        len(factors), rng=seed
-    )
-    yield from points_at(factors, sampler.random(design.points or 0))
-
-
-def saltelli(design: Design, factors: Factors, seed: int) -> Points:
-    """A, B, then for each factor A with its column replaced by B's. `table.response_indices` relies on this order.
-
-    A and B are the two halves of the columns of one scrambled Sobol sequence of dimension 2 D.
-    """
-    count = design.points or 0
-    width = len(factors)
-    coordinates = scipy.stats.qmc.Sobol(2 * width, rng=seed).random(count)
-    a = coordinates[:, :width]
-    b = coordinates[:, width:]
-    yield from points_at(factors, a)
-    yield from points_at(factors, b)
-    for n in range(width):
-        yield from points_at(factors, np.where(np.arange(width) == n, b, a))
-
-
-DESIGNS: dict[str, Callable[[Design, Factors, int], Points]] = {
-    "factorial": factorial,
-    "one_at_a_time": one_at_a_time,
-    "lhs": sample,
-    "sobol": sample,
-    "saltelli": saltelli,
-}

@@ -1,4 +1,4 @@
-"""Functions and objects that a user gives to a study in Python: their names, identity and way to other processes.
+"""Functions and objects that a user gives to a study in Python: their identity and way to other processes.
 
 A study keeps a digest of each of them, so that trials of a changed function are not mixed with earlier ones.
 """
@@ -6,7 +6,7 @@ A study keeps a digest of each of them, so that trials of a changed function are
 import hashlib
 import sys
 import sysconfig
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from types import BuiltinFunctionType, CodeType, FunctionType, ModuleType
@@ -15,15 +15,9 @@ from uuid import uuid4
 
 import numpy as np
 
-from estimator.trackers.dome_tracker import DomeTracker
-from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError
 from skysim.core.paths import ROOT
 from skysim.core.plugins import Programs, describe_error
 from skysim.core.yaml_reader import is_file
-from skysim.dynamics.controllers import CONTROLLERS
-from skysim.simulation.lab import name_of
-from skysim.tracking.tracker_interface import OWN
 
 # Beginnings of the paths of code that is not the user's. That of skysim and estimator is in the version that a store
 # keeps (`trials.code_version`).
@@ -94,34 +88,6 @@ def names_in(code: CodeType) -> set[str]:
     """The names of globals in compiled code and in the functions in it."""
     inner = (names_in(one) for one in code.co_consts if isinstance(one, CodeType))
     return set(code.co_names).union(*inner)
-
-
-def digests_of(programs: Programs) -> dict[str, str]:
-    """The digests of the functions and objects among external trackers and controllers, by name."""
-    return {
-        name: digest_of(one) for name, one in programs.items() if not isinstance(one, str)
-    }
-
-
-def with_names(value: Any, programs: dict[str, Any]) -> Any:
-    """A value of a study or a scene with names for functions and trackers in it, which are added to `programs`.
-
-    Raises InputError for two with one name, and for the name of one of skysim's own.
-    """
-    if isinstance(value, Mapping):
-        return {key: with_names(inner, programs) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [with_names(inner, programs) for inner in value]
-    if not (callable(value) or isinstance(value, StarTracker | DomeTracker)):
-        return value
-    return register(name_of(value), value, programs)
-
-
-def register(name: str, part: Any, programs: dict[str, Any]) -> str:
-    """Add a tracker or controller to the programs, and return its name. Raises InputError if that is in use."""
-    if programs.setdefault(name, part) is not part or name in (OWN, *CONTROLLERS.own):
-        raise InputError(name, "name already in use", f"a mapping such as {{'my_{name}': …}}")
-    return name
 
 
 def unsendable(programs: Programs) -> str:

@@ -1,7 +1,5 @@
 """Schema of a study file (YAML) and its validated `Plan`: scene, trial, design points, replicates and responses."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping

@@ -18,7 +18,7 @@ from skysim.core.units import in_si
 from skysim.experiments.study.execution.engines import Engine
 from skysim.experiments.study.execution.runner import Progress, Watch, run
 from skysim.experiments.study.execution.store import TIMES, Store
-from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, TrialJob
+from skysim.experiments.study.execution.trials import REFUSED, Row, Segment, blank_rows
 from skysim.experiments.study.factors import (
     Distribution,
     Factor,
@@ -106,7 +106,7 @@ class Candidate(NamedTuple):
     Attributes
     ----------
     figures
-        Statistic of each response that is an objective or a constraint
+        Statistic of each response that is an objective or a constraint, and the cost
     feasible
         Whether all constraints hold for the values (intervals are ignored), and none is missing
     refused
@@ -202,13 +202,13 @@ def evaluate_candidate(
         name: metrics.response(name)(columns) for name in config.responses if name != COST
     }
     price, unpriced = cost(plan, point)
-    values = {name: figure.value for name, figure in figures.items()} | {COST: price}
-    objectives = tuple(values[one.response] for one in config.objectives)
-    violated = [
-        one.response for one in config.constraints if violation(one, values[one.response]) > 0
-    ]
+    figures[COST] = metrics.Summary(price)
+    objectives = tuple(figures[one.response].value for one in config.objectives)
+    violated = [one.response for one in config.constraints if violation(one, figures) > 0]
     violated += [
-        f"no {one.response}" for one in config.objectives if math.isnan(values[one.response])
+        f"no {one.response}"
+        for one in config.objectives
+        if math.isnan(figures[one.response].value)
     ]
     refused = scene_error(columns)
     why = refused or unpriced or ", ".join(violated)
@@ -217,8 +217,9 @@ def evaluate_candidate(
     )
 
 
-def violation(limit: Constraint, value: float) -> float:
+def violation(limit: Constraint, figures: Mapping[str, metrics.Summary]) -> float:
     """Relative violation of a constraint, (value - bound) / |bound|; <= 0 if it holds, MISSING_VIOLATION for NaN."""
+    value = figures[limit.response].value
     if math.isnan(value):
         return MISSING_VIOLATION
     bounds = ((limit.at_most, 1), (limit.at_least, -1))
@@ -384,11 +385,8 @@ def report_to_sampler(
 
     A candidate without values gets infinitely bad objectives and an extra violated constraint.
     """
-    values = {name: figure.value for name, figure in candidate.figures.items()} | {
-        COST: candidate.cost
-    }
     for n, limit in enumerate(config.constraints):
-        proposal.set_constraint(str(n), violation(limit, values[limit.response]))
+        proposal.set_constraint(str(n), violation(limit, candidate.figures))
     valid = not candidate.refused and not any(math.isnan(one) for one in candidate.objectives)
     proposal.set_constraint("answered", 0.0 if valid else MISSING_VIOLATION)
     worst = [math.inf if one.better == "less" else -math.inf for one in config.objectives]
@@ -432,10 +430,10 @@ def run_candidate(
 def failed_rows(plan: Plan, store: Store, number: int) -> list[Row]:
     """Rows for the remaining trials of a candidate with an invalid scene: failed, with the error of the first one."""
     columns = store.point_columns(number)
-    replicates = plan.study.replicates
-    missing = np.setdiff1d(np.arange(replicates), columns["replicate"]).tolist()
-    job = TrialJob(plan.spec)
-    first = number * replicates
-    segments = (Segment(number, {}, first + k, range(k, k + 1)) for k in missing)
+    each = plan.study.replicates
     error = scene_error(columns)
-    return [job.failed(one, error)._replace(scene=REFUSED) for one in segments]
+    return [
+        row._replace(scene=REFUSED, error=error)
+        for row in blank_rows(plan.spec, Segment(number, {}, number * each, range(each)))
+        if row.replicate not in columns["replicate"]
+    ]

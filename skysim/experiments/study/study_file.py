@@ -31,7 +31,7 @@ from skysim.experiments.study.factors import (
     each_level,
     points,
 )
-from skysim.experiments.study.own_code import digests_of
+from skysim.experiments.study.own_code import digest_of
 from skysim.experiments.study.plan import (
     TRIAL,
     AttitudeRange,
@@ -147,7 +147,7 @@ def make_plan(path: Path, study: Study, trial: Tree, programs: Programs, text: s
         study.paired,
         study.hardware,
         dict(programs),
-        digests_of(programs),
+        {name: digest_of(one) for name, one in programs.items() if not isinstance(one, str)},
     )
     if study.optimize is None:
         chosen = points(study.design, study.factors, study.seed)
@@ -238,10 +238,9 @@ def check_figures(plan: Plan) -> None:
 
 def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:
     """Every figure and threshold with its key in the study file."""
-    for n, figure in enumerate(study.figures):
-        yield f"figures.{n}", figure
-    for n, threshold in enumerate(study.thresholds):
-        yield f"thresholds.{n}", threshold
+    for section in ("figures", "thresholds"):
+        for n, one in enumerate(getattr(study, section)):
+            yield f"{section}.{n}", one
 
 
 def check_hardware(study: Study) -> None:

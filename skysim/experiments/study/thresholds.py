@@ -136,9 +136,7 @@ def certain_levels(
     x
         (L,) levels in the order in which the proportion falls
     """
-    counts = list(
-        zip(x.tolist(), hits.astype(int).tolist(), trials.astype(int).tolist(), strict=True)
-    )
+    counts = np.column_stack([x, hits, trials]).tolist()
     above = beneath = None
     for place, count, total in counts:
         if metrics.exact_bounds(count, total)[0] < limit:

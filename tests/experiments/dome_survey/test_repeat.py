@@ -80,6 +80,6 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
         with pytest.raises(
             InputError, match=f"survey: {parameter} .* contradicts the assumed"
         ):
-            adjust.check_plausible(run, survey_frames.assumed(before))  # type: ignore[arg-type]
+            adjust.check_plausible(run, adjust.assumed(before))  # type: ignore[arg-type]
     else:
-        adjust.check_plausible(run, survey_frames.assumed(before))  # type: ignore[arg-type]
+        adjust.check_plausible(run, adjust.assumed(before))  # type: ignore[arg-type]

@@ -163,21 +163,19 @@ def test_centroids_scatter_as_declared_in_the_trial() -> None:
 def test_false_lights_have_no_centroid_error() -> None:
     centroids_px = np.array([[10.0, 10.3], [50.0, 50.0]])
     true_px = np.array([[10.0, 10.0], [90.0, 90.0]])
-    assert outcomes.centroid_error_px(centroids_px, true_px, 3.0) == pytest.approx(
-        0.3 / math.sqrt(2)
-    )
-    assert math.isnan(outcomes.centroid_error_px(centroids_px[1:], true_px, 3.0))
-    assert math.isnan(outcomes.centroid_error_px(np.empty((0, 2)), true_px, 3.0))
+    assert outcomes.distances_px(centroids_px, true_px, 3.0) == pytest.approx([0.3])
+    assert math.isnan(outcomes.rms(outcomes.distances_px(centroids_px[1:], true_px, 3.0)))
+    assert math.isnan(outcomes.rms(outcomes.distances_px(np.empty((0, 2)), true_px, 3.0)))
 
 
 def test_a_detection_is_of_a_light_or_of_none() -> None:
     """Of three lights one has two detections and one has none; a detection is far from all of them."""
     lights_px = np.array([[10.0, 10.0], [50.0, 50.0], [90.0, 90.0]])
     centroids_px = np.array([[10.0, 12.9], [8.0, 10.0], [53.1, 50.0], [90.0, 89.0]])
-    assert outcomes.near(lights_px, centroids_px, 3.0) == 2
-    assert outcomes.near(centroids_px, lights_px, 3.0) == 3
-    assert outcomes.near(centroids_px, np.empty((0, 2)), 3.0) == 0
-    assert outcomes.near(np.empty((0, 2)), lights_px, 3.0) == 0
+    assert len(outcomes.distances_px(lights_px, centroids_px, 3.0)) == 2
+    assert len(outcomes.distances_px(centroids_px, lights_px, 3.0)) == 3
+    assert not len(outcomes.distances_px(centroids_px, np.empty((0, 2)), 3.0))
+    assert not len(outcomes.distances_px(np.empty((0, 2)), lights_px, 3.0))
 
 
 def test_all_detections_without_noise_are_of_lights_and_false_ones_are_counted() -> None:

@@ -17,16 +17,16 @@ from estimator.core.types import Centroids
 from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
-from skysim.camera.render import OcclusionTest, Window
+from skysim.camera.render import Window
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Ints, Trajectory, taken
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
-from skysim.simulation.lab import MARGIN_S, Lab, StarCamera, exposure_window
+from skysim.simulation.lab import MARGIN_S, Lab, exposure_window
 from skysim.simulation.lights.effects import AirEffects
 from skysim.simulation.lights.emitters import LedDome
-from skysim.simulation.lights.light import Exposure, Obstacle, any_of, find_light
+from skysim.simulation.lights.light import Obstacle, any_of, find_light
 from skysim.sources.dome.led import lit_moments_s
 
 LEAST_SIGMA_PX = 1e-3
@@ -80,23 +80,18 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
     visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
     at_rest = Trajectory.at_rest(lab.start, MARGIN_S)
     start = exposure_of(camera, at_rest, 0, Window(0.0, 0.0), None)
+    obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
     views = []
     for n, (begin, end) in enumerate(itertools.pairwise(ends.tolist())):
         chosen = begin + np.flatnonzero(visible[begin:end])
-        occludes = occlusion(camera, replace(start, lab_from_body=lab_from_body[n]))
-        if occludes:
+        exposure = replace(start, lab_from_body=lab_from_body[n])
+        tests = [light.during(exposure).hides for light in obstacles]
+        if occludes := any_of([hides for hides in tests if hides]):
             chosen = chosen[~occludes(near.place[chosen])]
         views.append(
             VisibleSources(rows[n][chosen - begin], xy_px[chosen], electrons[chosen])
         )
     return views
-
-
-def occlusion(camera: StarCamera, exposure: Exposure) -> OcclusionTest | None:
-    """The test for places that something hides from a camera in an exposure; None if nothing can."""
-    obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
-    tests = [light.during(exposure).hides for light in obstacles]
-    return any_of([hides for hides in tests if hides])
 
 
 def simulate_detections(
@@ -195,9 +190,7 @@ def brightness(lab: Lab, rows: Ints, frame: int) -> Floats:
     assert isinstance(dome, LedDome)
     middle_s = (begin_s + end_s) / 2
     shown = dome.pulsed(dome.sources, lab.camera.run_seed, frame, window, middle_s).take(rows)
-    pulses = zip(
-        shown.period_s.tolist(), shown.start_s.tolist(), shown.on_s.tolist(), strict=True
-    )
+    pulses = np.column_stack([shown.period_s, shown.start_s, shown.on_s]).tolist()
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
     mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
     return shown.strength * lit_s / window.exposure_s / mean

@@ -210,16 +210,16 @@ def score(
         streak_px = float(np.median(lights.streak_px))
     reach_px = SAME_LIGHT_PX + (0.0 if math.isnan(streak_px) else streak_px / 2)
     own_tracker = isinstance(estimator, StarTracker | DomeTracker)
+    errors_px = distances_px(centroids_px, lights.flux_xy_px, reach_px)
     common: dict[str, Any] = {
         "stars": len(lights.xy_px),
         "detected": len(centroids_px),
         "matched": len(solution.match.observed) if solution.match else 0,
         "ambiguous": int(solution.status.startswith(AMBIGUOUS)),
         **dict.fromkeys(IDENTITY, 0.0 if own_tracker else nan),
-        "centroid_px": centroid_error_px(centroids_px, lights.flux_xy_px, reach_px),
-        "lights_detected": near(lights.flux_xy_px, centroids_px, reach_px),
-        "false_detections": len(centroids_px)
-        - near(centroids_px, lights.flux_xy_px, reach_px),
+        "centroid_px": rms(errors_px) / math.sqrt(2),
+        "lights_detected": len(distances_px(lights.flux_xy_px, centroids_px, reach_px)),
+        "false_detections": len(centroids_px) - len(errors_px),
         "streak_px": streak_px,
         "angles_compared": solution.angles_compared or nan,
         "detect_ms": 1e3 * report.seconds.get("detect", nan),
@@ -307,16 +307,10 @@ def count_wrong_matches(
     return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))
 
 
-def centroid_error_px(centroids_px: Floats, true_px: Floats, reach_px: float) -> float:
-    """RMS error of the centroids about each axis, of those within reach_px of a true image; NaN if there are none."""
-    _, distance_px = nearest_light(centroids_px, true_px)
-    distance_px = distance_px[distance_px <= reach_px]
-    return rms(distance_px) / math.sqrt(2)
-
-
-def near(xy_px: Floats, others_px: Floats, reach_px: float) -> int:
-    """Number of positions with another one within reach_px."""
-    return int(np.sum(nearest_light(xy_px, others_px)[1] <= reach_px))
+def distances_px(xy_px: Floats, others_px: Floats, reach_px: float) -> Floats:
+    """(K,) distances of positions from the nearest other one, of those within reach_px of it."""
+    _, distance_px = nearest_light(xy_px, others_px)
+    return distance_px[distance_px <= reach_px]
 
 
 @jit
@@ -343,16 +337,16 @@ def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], 
 def directions(lab: Lab, lab_from_body: Floats, cam_from_lab: Floats) -> dict[str, float]:
     """The columns DIRECTION of an attitude."""
     values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
-    z = np.array([0.0, 0.0, 1.0])
-    if lab.scene.dome:
-        x, y, z_lab = quaternion.apply(lab_from_body, z).tolist()
-        values["body_tilt_deg"] = math.degrees(math.atan2(math.hypot(x, y), z_lab))
-        values["body_azimuth_deg"] = math.degrees(math.atan2(y, x)) % 360
-    else:
-        x, y, z_lab = quaternion.apply(quaternion.inverse(cam_from_lab), z).tolist()
-        values["boresight_ra_deg"] = math.degrees(math.atan2(y, x)) % 360
-        values["boresight_dec_deg"] = math.degrees(math.atan2(z_lab, math.hypot(x, y)))
-    return values
+    dome = lab.scene.dome
+    turn = lab_from_body if dome else quaternion.inverse(cam_from_lab)
+    x, y, z = quaternion.apply(turn, np.array([0.0, 0.0, 1.0])).tolist()
+    around_deg = math.degrees(math.atan2(y, x)) % 360
+    across = math.hypot(x, y)
+    if dome:
+        tilt_deg = math.degrees(math.atan2(across, z))
+        return values | {"body_tilt_deg": tilt_deg, "body_azimuth_deg": around_deg}
+    dec_deg = math.degrees(math.atan2(z, across))
+    return values | {"boresight_ra_deg": around_deg, "boresight_dec_deg": dec_deg}
 
 
 # Flights.

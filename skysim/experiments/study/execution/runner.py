@@ -408,8 +408,11 @@ def replay(
     (row,) = run_block(plan.spec, segment)
     reasons: list[str] = []
     stored = store.trial(trial) if store.done(trial + 1)[trial] else {}
-    now = {name: to_sql(getattr(row.outcome, name)) for name in FIELDS}
-    changed = [name for name, value in now.items() if stored and stored[name] != value]
+    changed = [
+        name
+        for name in FIELDS
+        if stored and stored[name] != to_sql(getattr(row.outcome, name))
+    ]
     if row.scene not in ("", REFUSED):  # an invalid scene has no lab
         setup = prepared_setup(plan.spec, segment.settings)
         recording.remove_results(make_folder(folder))
@@ -466,10 +469,8 @@ def replayed_frame(setup: TrialSetup, seed: int) -> tuple[Frame, Truth, Report]:
     """
     trial = setup.trial
     if isinstance(trial, CentroidTrial):
-        frame_trial = FrameTrial(
-            kind="frames",
-            **{name: getattr(trial, name) for name in ("tilt_deg", "dec_deg", "near")},
-        )
+        attitude = trial.model_dump(include={"tilt_deg", "dec_deg", "near"})
+        frame_trial = FrameTrial(kind="frames", **attitude)
         frame, truth, _ = render_trial_frame(setup._replace(trial=frame_trial), seed)
         return (
             frame,

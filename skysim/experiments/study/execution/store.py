@@ -25,12 +25,12 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, remove, room_left
-from skysim.core.types import Bools, Ints, Record
+from skysim.core.types import Bools, Record
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
 from skysim.results.files import row_parts
-from skysim.results.files.row_parts import Array, Part, Rows, Source
+from skysim.results.files.row_parts import Array, Part, Rows
 
 STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 10  # raised when the columns of `trials` or `timings` change
@@ -159,11 +159,11 @@ class Store:
             ]
             for part in self.parts():
                 part.trials(self._replicates())  # is as listed
-                columns = [
-                    row_parts.read_column(part.path, name)[[0, -1]]
+                columns = (
+                    row_parts.read_column(part.path, name)[[0, -1]].tolist()
                     for name in ("point", "replicate", "scene")
-                ]
-                found += zip(*(column.tolist() for column in columns), strict=True)
+                )
+                found += zip(*columns, strict=True)
         found = [self.checked(row, int, int, str) for row in found]
         return [min(found), max(found)] if found else []
 
@@ -296,11 +296,9 @@ class Store:
         rows = self.db.execute(
             "SELECT engine, workers, trials, seconds FROM runs ORDER BY run"
         )
-        known = (self.checked(row, str, int, int, float) for row in rows)
-        return [
-            dict(zip(("engine", "workers", "trials", "seconds"), row, strict=True))
-            for row in known
-        ]
+        names = ("engine", "workers", "trials", "seconds")
+        types = (str, int, int, float)
+        return [dict(zip(names, self.checked(row, *types), strict=True)) for row in rows]
 
     def done(self, count: int) -> Bools:
         """(count,) mask of the trials in the store, failed ones included."""
@@ -375,7 +373,7 @@ class Store:
                 default=point,
             )
             near = range(point, last + 1)
-            rows = self._rows(ranges_of(range(point, last + 1), self._replicates()))
+            rows = self._rows(ranges_of(near, self._replicates()))
             self._near = near, rows
         if len(near) == 1:
             return rows
@@ -403,17 +401,12 @@ class Store:
         where
             SQL condition for the rows in SQLite
         """
-        sources = list[Source]()
-        numbers = list[Ints]()
+        condition = f"trial >= ? AND trial < ? AND {where}"
         with self.snapshot():
-            for part in self.parts():
-                if (source := part.source(ranges, self._replicates())) is not None:
-                    sources.append(source)
-                    numbers.append(source("trial"))
-            for one in ranges:
-                kept = self._kept_columns(f"trial >= ? AND trial < ? AND {where}", one)
-                sources.append(kept.__getitem__)
-                numbers.append(kept["trial"])
+            found = [part.source(ranges, self._replicates()) for part in self.parts()]
+            found += [self._kept_columns(condition, one).__getitem__ for one in ranges]
+        sources = [source for source in found if source is not None]
+        numbers = [source("trial") for source in sources]
         trial = np.concatenate(numbers)
         in_order = bool(np.all(trial[1:] > trial[:-1]))
         order = None if in_order else np.argsort(trial, kind="stable")

@@ -239,19 +239,16 @@ class TrialJob:
 
     def failed(self, segment: Segment, error: str) -> Row:
         """The row of a trial that repeatedly killed its worker."""
-        replicate = segment.replicates[0]
-        seed = seed_of(self.spec, segment.point, replicate)
-        return Row(
-            segment.first,
-            segment.point,
-            replicate,
-            seed,
-            "",
-            code_version(),
-            FAILED,
-            error,
-            0.0,
-        )
+        return blank_rows(self.spec, segment)[0]._replace(error=error)
+
+
+def blank_rows(spec: TrialSpec, segment: Segment) -> list[Row]:
+    """The rows of a segment's trials before they run: failed, without a scene and an error."""
+    point = segment.point
+    return [
+        Row(trial, point, k, seed_of(spec, point, k), "", code_version(), FAILED, None, 0.0)
+        for trial, k in enumerate(segment.replicates, segment.first)
+    ]
 
 
 def block_size(spec: TrialSpec, segment: Segment) -> int:
@@ -277,20 +274,19 @@ def run_block(spec: TrialSpec, segment: Segment) -> list[Row]:
 
     If one of them raises an exception, each is run alone, and the row of the faulty one stores the exception.
     """
-    numbers = list(enumerate(segment.replicates, segment.first))
-    seeds = [seed_of(spec, segment.point, replicate) for _, replicate in numbers]
+    rows = blank_rows(spec, segment)
     scene = ""
-    outcomes = [FAILED] * len(seeds)
+    outcomes = [FAILED] * len(rows)
     error = None
     start_s = time.perf_counter()
     try:
         setup = prepared_setup(spec, segment.settings)
         scene = setup.scene_hash
         start_s = time.perf_counter()
-        outcomes = TRIALS[setup.trial.kind](setup, seeds)
+        outcomes = TRIALS[setup.trial.kind](setup, [row.seed for row in rows])
     except Exception as raised:
         errors.raise_wrapped(raised)
-        if len(seeds) > 1:
+        if len(rows) > 1:
             return [row for one in divided(segment, 1) for row in run_block(spec, one)]
         if isinstance(raised, errors.InputError):
             scene = scene or REFUSED
@@ -298,20 +294,10 @@ def run_block(spec: TrialSpec, segment: Segment) -> list[Row]:
         else:
             # The stored text must not depend on the installation path.
             error = traceback.format_exc().replace(f"{ROOT}/", "")
-    seconds = (time.perf_counter() - start_s) / len(seeds)
+    seconds = (time.perf_counter() - start_s) / len(rows)
     return [
-        Row(
-            trial,
-            segment.point,
-            replicate,
-            seed,
-            scene,
-            code_version(),
-            outcome,
-            error,
-            seconds,
-        )
-        for (trial, replicate), seed, outcome in zip(numbers, seeds, outcomes, strict=True)
+        row._replace(scene=scene, outcome=outcome, error=error, seconds=seconds)
+        for row, outcome in zip(rows, outcomes, strict=True)
     ]
 
 
@@ -442,9 +428,10 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
     attitudes = trial.start if isinstance(trial, FlightTrial) else trial
     assert attitudes is not None
     near = attitudes.near
+    under_dome = lab.scene.dome is not None
     turns = [rng.uniform(0, 2 * math.pi, 2).tolist() for rng in rngs]
     # A uniform cosine of the tilt, or sine of the declination, is uniform in solid angle.
-    if lab.scene.dome:
+    if under_dome:
         tilt_deg = attitudes.tilt_deg
         low, high = tilt_deg if isinstance(tilt_deg, tuple) else (tilt_deg,) * 2
         ends = math.cos(math.radians(high)), math.cos(math.radians(low))
@@ -454,11 +441,12 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
             high, low = (math.pi / 2 - math.radians(off) for off in near.off_deg)
         ends = math.sin(low), math.sin(high)
     zeniths = [math.acos(min(max(rng.uniform(*ends), -1.0), 1.0)) for rng in rngs]
-    angles = [(*turn, zenith) for turn, zenith in zip(turns, zeniths, strict=True)]
-    if lab.scene.dome:
-        drawn = [zyz(first, tilt, last - first) for first, last, tilt in angles]
-    else:
-        drawn = [zyz(first, zenith, last) for first, last, zenith in angles]
+    # Under a dome the second turn is the yaw, which contains that of the tilt.
+    drawn = [
+        zyz(first, zenith, last - first * under_dome)
+        for (first, last), zenith in zip(turns, zeniths, strict=True)
+    ]
+    if not under_dome:
         if near:
             lab_from_pole = lab_from_body_pole(near.body, lab.scene)
             drawn = [quaternion.multiply(lab_from_pole, each) for each in drawn]

@@ -5,7 +5,7 @@ no two share a level, so they are not grouped by level but shown as points, with
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -139,11 +139,11 @@ def series(lines: PointTable, figure: Curve) -> list[Series]:
             continue
         ordered = sorted(group, key=x_axis.at)
         x = np.array(list(map(x_axis.at, ordered)))
-        summaries = [line.responses[figure.y] for line in ordered]
-        value, low, high = np.array([one[:3] for one in summaries], dtype=float).T
-        count = np.array([one.trials for one in summaries])
+        value, low, high, count, _ = np.array(
+            [line.responses[figure.y] for line in ordered]
+        ).T
         few = np.array([has_few_values(line, figure.y) for line in ordered])
-        found.append(Series(name, x, value, low, high, count, few))
+        found.append(Series(name, x, value, low, high, count.astype(int), few))
     return found
 
 
@@ -174,12 +174,9 @@ def limits(
     """
     if share and not log:
         return -0.03, 1.03
-    inner, outer = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, bounds))
-    inner = inner[np.isfinite(inner)]
-    outer = outer[np.isfinite(outer)]
+    both = (np.concatenate([*arrays, np.empty(0)]) for arrays in (values, bounds))
+    inner, outer = (one[np.isfinite(one) & ((one > 0) | (not log))] for one in both)
     if log:
-        inner = inner[inner > 0]
-        outer = outer[outer > 0]
         outer = outer[
             outer > (inner.min() if len(inner) else outer.max(initial=0.0)) / FAR_RATIO
         ]
@@ -207,31 +204,26 @@ def expected_value(name: str) -> float | None:
 
 def panels(lines: PointRows, search: Search, costs: Mapping[int, float]) -> dict[str, Panel]:
     """One panel per objective, constrained response and cost; by name."""
-    names = dict.fromkeys([*search.responses, "cost"])
-    return {name: panel(name, lines, search, costs) for name in names}
-
-
-def panel(name: str, lines: PointRows, search: Search, costs: Mapping[int, float]) -> Panel:
-    """The panel of one response, or of `cost`, over the candidates."""
-    if name == "cost":
-        summaries: list[Any] = [
-            (costs.get(line.point, np.nan), np.nan, np.nan) for line in lines
+    found = {}
+    for name in dict.fromkeys([*search.responses, "cost"]):
+        summaries = [
+            line.responses.get(name, metrics.Summary(costs.get(line.point, np.nan)))[:3]
+            for line in lines
         ]
-    else:
-        summaries = [line.responses[name][:3] for line in lines]
-    bounds = [
-        bound
-        for one in search.constraints
-        if one.response == name
-        for bound in (one.at_least, one.at_most)
-        if bound is not None
-    ]
-    title = label(name)
-    for goal in search.objectives:
-        if goal.response == name:
-            title += f", {goal.better} is better"
-    value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
-    return Panel(title, value, low, high, bounds)
+        bounds = [
+            bound
+            for one in search.constraints
+            if one.response == name
+            for bound in (one.at_least, one.at_most)
+            if bound is not None
+        ]
+        title = label(name)
+        for goal in search.objectives:
+            if goal.response == name:
+                title += f", {goal.better} is better"
+        value, low, high = np.array(summaries, dtype=float).reshape(-1, 3).T
+        found[name] = Panel(title, value, low, high, bounds)
+    return found
 
 
 # Captions.

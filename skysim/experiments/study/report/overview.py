@@ -148,13 +148,12 @@ def greatest_tilt_deg(scene: Scene, trial: Trial) -> float | None:
 
 def finding_text(at: Texts, checked: int) -> str:
     """Text of a finding that has other numbers at other levels: the first one, and the levels at which it was found."""
-    others = [levels for _, levels in at[1:]]
-    (line, first) = at[0]
-    if len(at) == checked and len({text for text, _ in at}) == 1:
+    line, first = at[0]
+    if len(at) != checked:
+        return f"{line} [{'; '.join(levels for _, levels in at)}]"
+    if len({text for text, _ in at}) == 1:
         return line
-    if len(at) == checked:
-        return f"{line} [{first}; with other numbers at all others]"
-    return f"{line} [{'; '.join([first, *others])}]"
+    return f"{line} [{first}; with other numbers at all others]"
 
 
 def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
@@ -212,9 +211,7 @@ def options(factor: Factor) -> list[Option]:
     """The levels of a factor, the ends of a range, or the median of a distribution."""
     if isinstance(factor, Range):
         return [factor.value_at(0.0), factor.value_at(1.0)]
-    return (
-        [factor.value_at(0.5)] if isinstance(factor, Distribution) else list(factor.options())
-    )
+    return factor.options() or [factor.value_at(0.5)]
 
 
 # The table.

@@ -24,7 +24,11 @@ def to_csv(store: Store, responses: Names, path: Path) -> None:
     Columns without any value are left out, for example those of flights in a study of frames.
     """
     levels = level_columns(store)
-    names = names_with_values(store)
+    empty = set(COLUMNS)
+    for block in store.blocks():
+        empty -= {name for name in empty if has_values(block[name])}
+    # Without trials all columns are kept.
+    names = [name for name in (*COLUMNS, *levels) if name not in empty or "trial" in empty]
     with (
         files.atomic_file(path) as temporary,
         temporary.open("w", newline="", encoding="utf-8") as file,
@@ -34,15 +38,6 @@ def to_csv(store: Store, responses: Names, path: Path) -> None:
         for block in store.blocks():
             columns = with_levels(block, levels)
             writer.writerows(zip(*(texts(columns[name]) for name in names), strict=True))
-
-
-def names_with_values(store: Store) -> list[str]:
-    """Names of the columns of `trial_columns` that are not empty; all names if there are no trials."""
-    every = [*COLUMNS, *level_columns(store)]
-    empty = set(COLUMNS)
-    for block in store.blocks():
-        empty -= {name for name in empty if has_values(block[name])}
-    return every if "trial" in empty else [name for name in every if name not in empty]
 
 
 def has_values(column: Array) -> bool:
@@ -89,8 +84,8 @@ def to_parquet(store: Store, responses: Names, path: Path) -> None:
             writer.write_table(rows)
 
 
-def dataset(store: Store, responses: Names, path: Path) -> Any:
-    """An xarray.Dataset of every response with its interval and count.
+def to_zarr(store: Store, responses: Names, path: Path) -> None:
+    """Write an xarray.Dataset of every response with its interval and count as a Zarr folder.
 
     The dimensions are the factors if the design is a full factorial, otherwise the points. Raises InputError if
     xarray or pandas is not installed.
@@ -112,12 +107,7 @@ def dataset(store: Store, responses: Names, path: Path) -> Any:
     )
     meta = {key: store.meta(key) for key in META}
     indexed = frame.set_index(factors if full else ["point"])
-    return xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)
-
-
-def to_zarr(store: Store, responses: Names, path: Path) -> None:
-    """Write `dataset` as a Zarr folder."""
-    tables = dataset(store, responses, path)
+    tables = xarray.Dataset.from_dataframe(indexed).assign_attrs(meta)
     with files.atomic_folder(path) as temporary:
         tables.to_zarr(temporary, mode="w", consolidated=False)
 
