@@ -109,6 +109,7 @@ OUT_OF_REACH = {
     "skysim.results.run_report.run_report": "takes a picture of ours into a page",
     "skysim.experiments.study.execution.trials.code_version": SOURCES,
     "skysim.experiments.study.execution.trials.scene_hash": SOURCES,
+    "skysim.experiments.study.execution.dask_engine.decode_chunk": OURS,
     "skysim.tracking.computer_time.fastest_mhz": "the system's own file, /proc/cpuinfo",
     "skysim.tracking.tracker_host.receive_picture": OURS,
     "skysim.tracking.tracker_interface.Setup.of_tree": OURS,

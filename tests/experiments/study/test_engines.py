@@ -329,6 +329,21 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
     yield from cluster_of(tmp_path_factory.mktemp("dask"), "--no-nanny", count=2)
 
 
+def test_a_chunk_travels_as_text_and_comes_back_bit_for_bit() -> None:
+    from skysim.experiments.study.execution import dask_engine
+
+    settings = {
+        "trial.noise_px": 0.1 + 0.2,
+        "light.layout": {"kind": "boards", "lit": [3, 6]},
+        "camera.focus": None,
+    }
+    chunk = (
+        trials.Segment(3, settings, 41, range(7, 12)),
+        trials.Segment(4, {}, 46, range(0, 1)),
+    )
+    assert dask_engine.decode_chunk(dask_engine.encode_chunk(chunk)) == chunk
+
+
 @pytest.mark.long
 def test_a_run_that_is_stopped_leaves_nothing_on_the_cluster(
     cluster: Cluster, plan_: plan.Plan

@@ -4,14 +4,13 @@ Scheduler and workers need this version of skysim. Each worker should be a proce
 `OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 NUMBA_NUM_THREADS=1 dask worker ADDRESS --nworkers 8 --nthreads 1`
 """
 
+import json
 import logging
-import operator
 import time
 from collections import deque
 from concurrent.futures import CancelledError
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from itertools import islice
 from typing import Any
 from uuid import uuid4
@@ -26,11 +25,10 @@ from skysim.experiments.study.execution.engines import (
     Chunk,
     Chunks,
     Job,
-    TimedRows,
     run_timed,
     split_chunk,
 )
-from skysim.experiments.study.execution.trials import code_version
+from skysim.experiments.study.execution.trials import Segment, code_version
 
 try:
     from distributed import Client, Future, KilledWorker, WorkerPlugin, as_completed
@@ -132,9 +130,13 @@ def collect_rows(
         room = (1 if alone else capacity) - len(in_flight)
         new = list(islice(source, max(room, 0)))
         # One message submits all, and results arrive in the background: a round trip for each would limit the speed.
-        # Each is a call of its own, because Dask searches other arguments for its task keys.
-        calls = [partial(run_named, name, chunk) for chunk in new]
-        futures = client.map(operator.call, calls, pure=False) if new else []
+        futures = (
+            client.map(
+                run_encoded, [name] * len(new), list(map(encode_chunk, new)), pure=False
+            )
+            if new
+            else []
+        )
         in_flight |= {
             future: (chunk, alone) for future, chunk in zip(futures, new, strict=True)
         }
@@ -157,6 +159,24 @@ def collect_rows(
                     retries.extend(split_chunk(chunk))
         if rows:
             yield rows
+
+
+def encode_chunk(chunk: Chunk) -> str:
+    """A chunk as JSON text, because Dask searches other arguments for its task keys. Floats round-trip exactly."""
+    rows = [
+        (one.point, one.settings, one.first, one.replicates.start, one.replicates.stop)
+        for one in chunk
+    ]
+    return json.dumps(rows, default=str)  # YAML dates become text, which scenes accept
+
+
+def decode_chunk(text: str) -> Chunk:
+    """The chunk in a text made by `encode_chunk`."""
+    rows = json.loads(text)
+    return tuple(
+        Segment(point, settings, first, range(*replicates))
+        for point, settings, first, *replicates in rows
+    )
 
 
 # On the workers.
@@ -184,13 +204,13 @@ class JobPlugin(WorkerPlugin):
         JOBS.pop(self.name, None)
 
 
-def run_named(name: str, chunk: Chunk) -> TimedRows:
+def run_encoded(name: str, text: str) -> tuple[list[Any], float]:
     """`run_timed` with the run's job on this worker. Raises InputError if `JobPlugin.setup` rejected it."""
     if name not in JOBS:
         raise InputError(
             "scheduler", f"a new worker has skysim {code_version()}", "the version of the run"
         )
-    return run_timed(JOBS[name], chunk)
+    return run_timed(JOBS[name], decode_chunk(text))
 
 
 class Dask:
