@@ -297,7 +297,9 @@ def _read(path: str | Path, *_state: int) -> StarCatalog:
     hip, count = np.unique(table[0], return_counts=True)
     if count.max() > 1:
         twice = hip[np.argmax(count)]
-        raise ImageError(f"{path}: star {twice:.0f} occurs {count.max()} times; allowed: once")
+        raise ImageError(
+            f"{path}: star {twice:.0f} occurs {count.max()} times; allowed: once"
+        )
     return from_columns(*table, epoch_yr=epoch_yr).brightest_first()
 
 
