@@ -1,6 +1,5 @@
 """Atomic writes of files and folders, tables, images and JSON."""
 
-import bisect
 import errno
 import json
 import os
@@ -195,11 +194,18 @@ def write_table(path: Path, table: Any) -> None:
         table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
+MAX_HEADER_LINES = 5000  # of an ECSV table; a map's has some hundred
+
+
 def read_table(path: Path) -> Any:
     """The astropy table in an ECSV file. Raises InputError if the file is not valid ECSV, with the first bad line."""
     from astropy.table import Table
 
     lines = read_lines(path)
+    # Before it is parsed, which takes a second for a thousand lines.
+    header = sum(line.startswith("#") for _, line in lines)
+    if header > MAX_HEADER_LINES:
+        raise InputError(path, f"a header of {header} lines", f"up to {MAX_HEADER_LINES}")
 
     def parse(some: list[Line]) -> Any:
         try:
@@ -212,17 +218,23 @@ def read_table(path: Path) -> Any:
 
     if not isinstance(table := parse(lines), Exception):
         return table
-    head = sum(line.startswith("#") for _, line in lines) + 1
-    count = bisect.bisect_left(
-        range(len(lines)), True, head + 1, key=lambda n: fails(lines[:n])
-    )
+    head = header + 1
+    # The first bad row: each step reads the half of the rows in which it is.
+    bad = head
+    end = len(lines)
+    while end - bad > 1:
+        middle = (bad + end) // 2
+        if fails([*lines[:head], *lines[bad:middle]]):
+            end = middle
+        else:
+            bad = middle
     # With another row alone, the header is read.
-    other = head + (count == head + 1)
+    other = head + (bad == head)
     if fails([*lines[:head], *lines[other : other + 1]]):
-        # A lookup that fails says nothing to a user: there are no such lines.
-        problem = "no lines" if isinstance(table, LookupError) else shortened(table, 120)
-        raise InputError(path, f"not an ECSV table: {problem}")
-    raise Where(path, lines[count - 1][0]).error("no row of the table")
+        # A lookup that fails says nothing to a user: there are no such lines; nor do the words of a conversion.
+        fault = "no lines" if isinstance(table, LookupError) else str(table).split(": ")[0]
+        raise InputError(path, f"not an ECSV table: {shortened(fault, 120)}")
+    raise Where(path, lines[bad][0]).error("no row of the table")
 
 
 def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:

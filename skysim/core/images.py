@@ -515,12 +515,17 @@ def monochrome(image: NDArray) -> NDArray:
     return image[:, :, :3] @ LUMINANCE
 
 
+LIVE_SOURCES = "an index such as 0, a video file, a URL"
+
+
 class LiveCamera:
     """An open camera or video stream, read frame by frame."""
 
     def __init__(self, source: str) -> None:
         self.source = source
         self.frame_count = 0
+        if Path(source).is_fifo():
+            raise InputError(source, "a pipe, which may never begin", LIVE_SOURCES)
         with silent_stderr():
             self.capture = cv2.VideoCapture(int(source) if source.isdigit() else source)
             self.capture.set(
@@ -534,9 +539,7 @@ class LiveCamera:
         if not ok or frame is None:
             if self.frame_count:
                 raise InputError(self.source, f"ends after {self.frame_count} frames")
-            raise InputError(
-                self.source, "no camera found", "an index such as 0, a video file, a URL"
-            )
+            raise InputError(self.source, "no camera found", LIVE_SOURCES)
         self.frame_count += 1
         return frame
 

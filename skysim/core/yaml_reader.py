@@ -275,16 +275,18 @@ def read_yaml(path: Path) -> tuple[Tree, str]:
 
 
 def reject_duplicate_keys(node: yaml.Node | None, path: Path) -> None:
-    """Raise InputError for a key that occurs twice in a mapping; YAML would silently use the last."""
+    """Raise InputError for a key that occurs twice in a mapping, of which YAML would use the last, or is null."""
     if isinstance(node, yaml.SequenceNode):
         for item in node.value:
             reject_duplicate_keys(item, path)
     if isinstance(node, yaml.MappingNode):
         names: set[str] = set()
         for key, value in node.value:
-            if str(key.value) in names:
+            is_null = key.tag.endswith(":null")
+            if is_null or str(key.value) in names:
                 where = Where(path, key.start_mark.line + 1)
-                raise InputError(excerpt(key.value), "duplicate key", where=where)
+                problem = "not a key" if is_null else "duplicate key"
+                raise InputError(excerpt(key.value or "null"), problem, where=where)
             names.add(str(key.value))
             reject_duplicate_keys(value, path)
 

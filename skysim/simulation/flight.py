@@ -19,6 +19,7 @@ from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
+from skysim.core.text import LARGEST
 from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth, frozen
 from skysim.dynamics import imu
 from skysim.dynamics.flight_computer import NO_COMMANDS, Commands
@@ -337,8 +338,11 @@ class Flight:
         if unknown:
             raise InputError(unknown[0], "no such actuators", ", ".join(sets))
         try:
+            if torque_nm is not None:
+                # Its square must be finite; the actuators give far less.
+                torque_nm = finite_array(torque_nm, "torque_nm", (3,)).clip(-LARGEST, LARGEST)
             return Commands(
-                None if torque_nm is None else finite_array(torque_nm, "torque_nm", (3,)),
+                torque_nm,
                 {
                     key: finite_array(values, key, sets[key].motor.shape)
                     for key, values in motors.items()

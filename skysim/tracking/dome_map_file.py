@@ -143,7 +143,7 @@ def read_covariance(path: Path, table: Any) -> dict[str, Floats]:
         }
     except (KeyError, TypeError, ValueError):
         found = {}
-    errors = len(found.get("common_camera", ()))
+    errors = len(np.atleast_1d(found.get("common_camera", ())))
     shapes = ((len(table), 3, 3), (errors, len(table), 3), (errors, 11))
     if (
         tuple(array.shape for array in found.values()) != shapes

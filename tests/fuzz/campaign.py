@@ -65,9 +65,9 @@ RAW = re.compile(
     r"|ufunc|dtype\('|<class|at 0x[0-9a-f]+"
     r"|could not convert|codec can't|Traceback|list index out|KeyError|IndexError|OpenCV\(|np\.float"
 )
-NAMES_PLACE = r": missing|columns |column names|(LED|star) \d|line \d|row \d|message \d|satellite \d|\.\d+"
+NAMES_PLACE = r": missing|no attitudes|column names|damaged|(LED|star) \d|line \d|row \d|message \d|satellite \d|\.\d+"
 NO_RESULT = re.compile(  # but for a count of things of that name, as in "1 inf"
-    r"(?<!\d )(?<![\w./-])(nan|inf|NaN|Infinity|NaT|None)(?![\w/-]| in )|\de\+?(1[6-9]|[2-9]\d|\d{3})\b"
+    r"(?<!\d )(?<![\w./-])(nan|inf|NaN|Infinity|NaT|None)(?![\w/-]| in )|(?<!\d )\b[\d.]*\de\+?(1[6-9]|[2-9]\d|\d{3})\b"
 )
 
 
@@ -906,10 +906,14 @@ def findings(name: str, case: Case, answer: Answer) -> Iterator[str]:
         and name != "runs"
         # The tracker uses some columns of a catalog only.
         and (name, case.words[0]) != ("catalogs", "solve")
+        # A link of that name to nowhere: the images have no attitudes.
+        and (name, case.mutant.what) != ("survey images", "dangling")
         and case.file.split("/")[0] in " ".join(case.words)
     ):
         yield f"taken: {case.mutant.what}"
-    if answer.code == 0 and (odd := NO_RESULT.search(re.sub(r'"what": .*', "", answer.out))):
+    if answer.code == 0 and (
+        odd := NO_RESULT.search(re.sub(r'"what": .*|report: .*', "", answer.out))
+    ):
         yield f"no number: {answer.out[max(odd.start() - 80, 0) : odd.end() + 20]!r}"
     lists = READERS[name].mutations
     listed = (

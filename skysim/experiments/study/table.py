@@ -480,7 +480,7 @@ def suits_log_scale(numbers: Floats) -> bool:
     """
     if len(numbers) < 4 or numbers[0] <= 0 or numbers[-1] < LOG_FACTOR_RATIO * numbers[0]:
         return False
-    steps = np.diff(numbers)
+    steps = np.diff(numbers / numbers[-1])
     ratios = np.diff(np.log(numbers))
     return bool(np.std(ratios) / np.mean(ratios) < np.std(steps) / np.mean(steps))
 
