@@ -6,6 +6,7 @@ answers each frame with a line of JSON; no file can name a command. docs/howto/e
 """
 
 import json
+import math
 import re
 import shlex
 import time
@@ -258,7 +259,7 @@ def check_answer(given: Any) -> Answer:
     quaternion = None
     if answer.cam_from_ref_xyzw is not None:
         quaternion = finite_array(answer.cam_from_ref_xyzw, "cam_from_ref_xyzw", (4,))
-        norm = float(np.linalg.norm(quaternion))
+        norm = math.hypot(*quaternion)
         if abs(norm - 1) > UNIT_TOLERANCE:
             raise ValueError(f"cam_from_ref_xyzw has norm {norm:.6g}; allowed: 1")
         quaternion = quaternion / norm

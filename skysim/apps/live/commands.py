@@ -14,6 +14,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
@@ -192,7 +193,7 @@ class CommandState:
             covariance = finite_array(value["covariance_rad2"], "covariance_rad2", (3, 3))
         except ValueError as error:
             raise InputError("attitude", error) from None
-        if abs(np.linalg.norm(quaternion) - 1) > QUATERNION_TOLERANCE:
+        if abs(math.hypot(*quaternion) - 1) > QUATERNION_TOLERANCE:
             raise InputError("attitude", "cam_from_ref_xyzw is not a unit quaternion")
         least, _, most = np.linalg.eigvalsh(covariance)
         is_symmetric = np.abs(covariance - covariance.T).max() <= ROUNDING * most
