@@ -186,7 +186,7 @@ def tab_of_own(browser: Any, server: Server) -> Any:
 def test_every_action_is_found_by_ctrl_k(tab_of_own: Any) -> None:
     page = tab_of_own
     page.keyboard.press("Control+k")
-    field = page.get_by_label("Action")
+    field = page.get_by_label("Action", exact=True)
     field.wait_for()
     listed = page.get_by_role("dialog").inner_text()
     for name in ("F5", "F10", "Ctrl Z", "panel: Monte Carlo", "export: truth", "light theme"):
@@ -221,7 +221,7 @@ def change_theme(page: Any) -> None:
     """Change between the dark and the light theme."""
     before = ground(page)
     page.keyboard.press("Control+k")
-    page.get_by_label("Action").fill("theme")
+    page.get_by_label("Action", exact=True).fill("theme")
     page.get_by_role("option").filter(has_text="theme").click()
     page.get_by_role("dialog").wait_for(state="detached")
     assert come(lambda: ground(page) != before)

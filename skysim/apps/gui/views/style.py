@@ -83,7 +83,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   text-overflow: ellipsis; white-space: nowrap; border: 1px solid {COLORS["line"]}; color: {COLORS["quiet"]} }}
 .lab-banner:is([data-state=flight], [data-state=replay], [data-state=photo]) {{
   border-color: {COLORS["warn"]}; color: {COLORS["warn"]} }}
-.lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
+.lab-scene {{ flex: 0 1 330px; min-width: 0 }} .lab-rate {{ width: 56px; text-align: right }}
 .lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
   display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; overflow-wrap: anywhere }}
 .lab-busy, .lab-rate, .lab-head .q-btn, .lab-head .q-toggle {{ flex: none }}
@@ -202,8 +202,9 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .nicegui-content {{ overflow: auto }}
   .lab {{ height: auto; grid-template: auto auto auto auto / minmax(0, 1fr);
     grid-template-areas: "head" "sensor" "side" "keys" }}
-  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab-title, .lab .lab-split {{ display: none }}
-  .lab-said {{ text-align: left; flex-basis: 200px }}
+  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab .lab-split {{ display: none }}
+  .lab-scene {{ flex: 1 1 150px }}
+  .lab-said {{ text-align: left; flex-basis: 120px }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto calc(min(70vh, 75vw) + 200px) }}
   .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}
