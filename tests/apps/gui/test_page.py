@@ -443,8 +443,8 @@ def test_f6_configures_image_processing_without_keys_that_have_no_effect(page: A
     assert come(lambda: status(page, "solved") != identified)
     assert come(lambda: "tracker.threshold_sigma%3D9" in address(page))
     choose_stage(page, "detector", "thesis")
-    page.get_by_label("tracker.threshold_sigma", exact=True).wait_for(state="detached")
-    assert page.get_by_label("tracker.min_area_px", exact=True).count() == 0
+    page.get_by_label("tracker.threshold_sigma", exact=True).wait_for(state="hidden")
+    assert page.get_by_label("tracker.min_area_px", exact=True).is_hidden()
     assert come(
         lambda: (
             "tracker.detector%3Dthesis" in address(page) and "threshold" not in address(page)

@@ -75,12 +75,13 @@ export default {
       this.paintLights();
       this.look(this.preset);
     },
-    // The newest frame: { wxyz: lab_from_body, seen: numbers on the frame, identified: [number, name] each }.
+    // The newest frame: { wxyz: lab_from_body, seen: numbers on the frame, identified: [number, name] each }. Without an
+    // attitude the vehicle stays.
     show({ wxyz, seen, identified }) {
       const fields = JSON.stringify([wxyz, seen, identified]);
       if (!this.vehicle || fields === this.newest) return;
       this.newest = fields;
-      this.vehicle.quaternion.set(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
+      if (wxyz) this.vehicle.quaternion.set(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
       this.lights.setFrame(new Set(seen), new Set(identified.map(([id]) => id)));
       const index = new Map(this.lab.lights.id.map((id, n) => [id, n]));
       this.named = identified.filter(([id]) => index.has(id)).map(([id, name]) => [index.get(id), name]);
