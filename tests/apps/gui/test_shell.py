@@ -358,7 +358,7 @@ def test_a_narrow_window_cuts_no_control(tab_of_own: Any, width: int) -> None:
       .filter(([_, box]) => box.left < 0 || box.right > innerWidth + 1).map(([name]) => name)"""
     panel(page, "Log")
     page.set_viewport_size({"width": width, "height": 800})
-    for name in ("Run", "Tracker", "Monte Carlo"):
+    for name in ("Run", "Lights", "Scene", "Monte Carlo"):
         panel(page, name)
         page.wait_for_timeout(500)
         assert page.evaluate(cut) == []

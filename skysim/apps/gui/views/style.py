@@ -71,7 +71,7 @@ body.body--light .lab-bar .q-checkbox__label {{ filter: brightness(.5) }}
 body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   font: 13px/1.45 Inter, system-ui, sans-serif }}
 .nicegui-content {{ padding: 0; gap: 0; height: 100vh; overflow: hidden }}
-.lab {{ display: grid; width: 100vw; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
+.lab {{ display: grid; width: 100%; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
   grid-template-columns: minmax(0, 1fr) min(var(--lab-side, clamp(430px, 36vw, 660px)), 70vw);
   grid-template-areas: "head head" "sensor side" "keys keys" }}
 .lab-head {{ grid-area: head }} .lab-sensor {{ grid-area: sensor }} .lab-side {{ grid-area: side }}
@@ -118,7 +118,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-facts {{ display: grid; grid-template-columns: 128px minmax(0, 1fr); gap: 4px 12px }}
 .lab-stops {{ display: grid; grid-template-columns: 40px repeat(4, minmax(0, 1fr)); gap: 0 10px; align-items: center }}
 .lab-stops .num {{ text-align: right }}
-.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
+.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-panels .q-tab-panel > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
 .lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
@@ -137,8 +137,10 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   background: {COLORS["panel"]} }}
 .lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
 .lab-turn {{ position: absolute; left: 8px; bottom: 6px; font-size: 11px; pointer-events: none; color: #aab3c2;
+.lab-lights {{ font-size: 11.5px }} .lab-lights th {{ white-space: normal }}
+.lab-lights tr > * {{ padding-left: 7px }} .lab-lights tr > :is(:first-child, :last-child) {{ width: 18%; max-width: 0;
+  overflow: hidden; text-overflow: ellipsis }}
   background: #0d1015b0; padding: 0 4px }}
-.stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto minmax(0, 1fr) / minmax(0, 1fr);
   border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}
 .lab-side {{ position: relative }}

@@ -164,7 +164,14 @@ export default {
       [canvas.width, canvas.height] = [clientWidth * devicePixelRatio, clientHeight * devicePixelRatio];
       pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
       const names = this.named.map(([n, name]) => [...this.place(n), name]).filter(([x]) => x !== null);
-      drawNames(pen, names, (x, y) => [x, y], [clientWidth, clientHeight], "#6ff0d8");
+      drawNames(pen, names, (x, y) => [x, y], [clientWidth, clientHeight], "#6ff0d8", this.overlaid());
+    },
+    // Boxes of the buttons and texts over the view.
+    overlaid() {
+      const { left, top } = this.$el.getBoundingClientRect();
+      return [this.$refs.label, ...this.$el.parentElement.querySelectorAll(".lab-looks > *, .lab-turn, .lab-push")]
+        .map((one) => one.getBoundingClientRect())
+        .map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top]);
     },
     // Where a light is on the screen; null behind the eye.
     place(n) {
