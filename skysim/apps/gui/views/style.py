@@ -97,6 +97,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-view {{ display: grid; grid-template: minmax(0, 1fr) 24px 176px / minmax(0, 1fr); min-width: 0; min-height: 0 }}
 .lab-frame {{ position: relative; min-height: 0; min-width: 0; margin: 0 14px; overflow: hidden }}
 .lab-frame > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; cursor: crosshair }}
+.lab-frame > canvas:focus-visible {{ outline-offset: -2px }}
 .lab-wait {{ position: absolute; inset: 0; display: flex; flex-direction: column; align-items: center; gap: 16px;
   justify-content: center; white-space: pre-line; text-align: center; line-height: 1.8; color: {COLORS["quiet"]};
   background: {COLORS["ground"]} }}
@@ -114,7 +115,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-under .mono {{ white-space: pre-wrap; font-size: 11px; line-height: 1.35 }} }}
 .lab-under > * {{ min-width: 0; overflow: hidden }}
 .lab-loupe {{ width: 252px; height: 160px; outline: 1px dashed {COLORS["line"]} }}
-.lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize }}
+.lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize; background: {DARK["ground"]} }}
+.lab-unseen {{ position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%) }}
 .lab-facts {{ display: grid; grid-template-columns: 128px minmax(0, 1fr); gap: 4px 12px }}
 .lab-stops {{ display: grid; grid-template-columns: 40px repeat(4, minmax(0, 1fr)); gap: 0 10px; align-items: center }}
 .lab-stops .num {{ text-align: right }}
@@ -135,11 +137,11 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
-.lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
-.lab-turn {{ position: absolute; left: 8px; bottom: 6px; font-size: 11px; pointer-events: none; color: #aab3c2;
 .lab-lights {{ font-size: 11.5px }} .lab-lights th {{ white-space: normal }}
 .lab-lights tr > * {{ padding-left: 7px }} .lab-lights tr > :is(:first-child, :last-child) {{ width: 18%; max-width: 0;
   overflow: hidden; text-overflow: ellipsis }}
+.lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
+.lab-turn {{ position: absolute; left: 8px; bottom: 6px; font-size: 11px; pointer-events: none; color: #aab3c2;
   background: #0d1015b0; padding: 0 4px }}
 .lab-side {{ display: grid; grid-template: auto minmax(0, 1fr) / minmax(0, 1fr);
   border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}
@@ -198,7 +200,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .q-tab {{ min-height: 34px; padding: 0 6px; text-transform: none }}
 .q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
-.lab-sections .q-item {{ padding: 2px 0 }}
+.lab-sections .q-item {{ padding: 2px 0 }} .lab-sections .given {{ font-weight: 600 }}
+.lab-sections .warn::before {{ content: "* " }}
 .q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}
 @media (max-width: 1000px) {{
   .nicegui-content {{ overflow: auto }}
