@@ -79,7 +79,7 @@ def screenshots() -> None:
         page.screenshot(path=IMAGES / "lab_page.jpg", quality=85)
         page.get_by_role("combobox", name="Scene").click()
         page.get_by_role("option", name="simsat_slew").click()
-        page.get_by_text("SimSat slews on its reaction wheels").wait_for()
+        page.get_by_text("yaw, deg").wait_for()  # of a dome
         page.get_by_role("tab", name="Run").click()
         page.get_by_role("button", name="Simulate").click()
         page.get_by_text(re.compile(r"^2\d\.\d\d s +\d+/34$")).wait_for()

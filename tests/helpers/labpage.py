@@ -240,7 +240,15 @@ def panel(page: Any, name: str) -> None:
 def chosen(page: Any, name: str, option: str) -> None:
     """Choose from a list."""
     page.get_by_role("combobox", name=name).click()
-    page.get_by_role("option", name=option, exact=True).click()
+    page.get_by_role("option", name=re.compile(f"^{re.escape(option)}(:|$)")).click()
+
+
+def open_scene(page: Any, name: str) -> None:
+    """Choose a scene from the list and wait for its first frame."""
+    frame = source(page)
+    chosen(page, "Scene", name)
+    changed(page, frame)
+    status(page, "solved")
 
 
 def choose_stage(page: Any, stage: str, algorithm: str) -> None:

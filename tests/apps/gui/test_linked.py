@@ -16,15 +16,14 @@ from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
-    chosen,
     come,
     exported,
+    open_scene,
     opened,
     panel,
     pictured,
     screen,
     simulate,
-    status,
 )
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
@@ -121,9 +120,7 @@ def test_too_many_residuals_are_thinned_by_whole_frames() -> None:
 def dome(browser: Any, server: Server) -> Any:
     """A tab with a dome."""
     with opened(browser, server.login, NARROW) as page:
-        chosen(page, "Scene", "afit_simsat")
-        page.get_by_text("AFIT SimSat under its measured dome").wait_for()
-        status(page, "solved")
+        open_scene(page, "afit_simsat")
         assert come(lambda: "dark 0" in drawn(page, "lights"))
         yield page
 

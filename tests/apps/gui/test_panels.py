@@ -280,7 +280,7 @@ def test_a_key_that_is_sought_before_the_form_is_filled_is_shown(tmp_path: Path)
         with client:
             tab = Tab("shefex2", tmp_path, tmp_path)
             await tab.build()
-            panel = tab.forms["Scene"]
+            panel = tab.form
             panel.find.value = "exposure.frames"
             for scene in ("shefex2", "afit_simsat"):
                 tab.set_state(scene=scene)

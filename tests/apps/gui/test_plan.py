@@ -33,7 +33,15 @@ from skysim.scene import loader
 from skysim.simulation import checks
 from skysim.simulation.lab import build_lab
 from skysim.tracking import dome_map_file
-from tests.helpers.labpage import CHROMIUM, SLOW_MS, chosen, come, panel, set_to, status
+from tests.helpers.labpage import (
+    CHROMIUM,
+    SLOW_MS,
+    chosen,
+    come,
+    open_scene,
+    panel,
+    set_to,
+)
 
 pytest_plugins = ["tests.helpers.labpage"]
 ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
@@ -279,14 +287,13 @@ def test_colors_differ_in_lightness() -> None:
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 def test_check_map_and_survey_work_in_the_page(page: Any) -> None:
-    chosen(page, "Scene", "afit_simsat")
-    page.wait_for_function("document.querySelector('.lab-title').innerText.includes('AFIT')")
-    status(page, "solved")
-    panel(page, "Plan")
+    open_scene(page, "afit_simsat")
+    panel(page, "Check")
     page.get_by_role("button", name="Check", exact=True).click()
     page.locator(".lab-facts").get_by_text("field of view").wait_for()
     page.get_by_role("button", name="Map", exact=True).click()
     page.get_by_text("fields look like another one").wait_for()
+    panel(page, "Survey")
     page.get_by_label("frames", exact=True).fill("5")
     page.get_by_role("button", name="Plan", exact=True).click()
     page.get_by_text("Predicted of the 1465 LEDs").wait_for()
@@ -323,10 +330,12 @@ def test_check_map_and_survey_work_in_the_page(page: Any) -> None:
     of_survey = page.get_by_text("the brighter the better")
     of_map = page.get_by_text("drawn in the 3-D view")
     of_survey.wait_for()
+    panel(page, "Check")
     assert of_map.is_hidden()
     page.get_by_role("button", name="Map", exact=True).click()  # it colors the LEDs anew
-    of_survey.wait_for(state="hidden")
     of_map.wait_for()
+    panel(page, "Survey")
+    assert of_survey.is_hidden()
     page.get_by_role("button", name="Plan", exact=True).click()
     page.get_by_text("A new survey forgets the 5 frames").wait_for()
     page.get_by_role("button", name="Cancel", exact=True).click()
@@ -336,14 +345,14 @@ def test_check_map_and_survey_work_in_the_page(page: Any) -> None:
     panel(page, "Scene")
     page.get_by_placeholder("find a key").fill("exposure.frames")
     set_to(page, "exposure.frames", "3")  # with another exposure the survey goes on
-    panel(page, "Plan")
+    panel(page, "Survey")
     page.get_by_text("after 10 frames").wait_for()
     adjust.click()
     page.get_by_text("no flight: fly the survey's attitudes").first.wait_for()
     page.get_by_role("button", name="Plan", exact=True).click()
     page.get_by_role("button", name="Begin anew", exact=True).click()
     page.get_by_text("after 4 frames").wait_for()  # the steps of a new plan
-    chosen(page, "Scene", "shefex2")
+    chosen(page, "Scene", "shefex2")  # and what was shown of the dome is not shown of the sky
     page.get_by_text("Plan begins a survey").wait_for()
     assert adjust.is_disabled()
     assert save.is_disabled()

@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from tests.helpers.labpage import CHROMIUM, angles, changed, chosen, come, source, status
+from tests.helpers.labpage import (
+    CHROMIUM,
+    angles,
+    changed,
+    come,
+    open_scene,
+    source,
+)
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
@@ -129,11 +136,7 @@ def test_only_a_moving_vehicle_can_be_pushed(scene: str, reason: str) -> None:
 @pytest.mark.browser
 @pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
 def test_dragging_the_vehicle_moves_it_and_reset_restores_it(page: Any) -> None:
-    last = source(page)
-    chosen(page, "Scene", "afit_simsat")
-    page.get_by_text("AFIT SimSat under its measured dome").wait_for()
-    changed(page, last)  # texts come with the frame
-    status(page, "solved")
+    open_scene(page, "afit_simsat")
     page.get_by_role("button", name="outside").click()
     before = angles(page)
     frame = source(page)
@@ -159,5 +162,4 @@ def test_dragging_the_vehicle_moves_it_and_reset_restores_it(page: Any) -> None:
     page.get_by_role("button", name="reset").click()
     assert come(lambda: bool(np.abs(angles(page) - before).max() < 1e-3))
     assert not moved.is_visible()
-    chosen(page, "Scene", "shefex2")
-    page.get_by_text("SHEFEX-2 star tracker on the real sky").wait_for()
+    open_scene(page, "shefex2")

@@ -186,7 +186,7 @@ def tab_of_own(browser: Any, server: Server) -> Any:
 def test_every_action_is_found_by_ctrl_k(tab_of_own: Any) -> None:
     page = tab_of_own
     page.keyboard.press("Control+k")
-    field = page.get_by_label("Action")
+    field = page.get_by_label("Action", exact=True)
     field.wait_for()
     listed = page.get_by_role("dialog").inner_text()
     for name in ("F5", "F10", "Ctrl Z", "panel: Monte Carlo", "export: truth", "light theme"):
@@ -221,7 +221,7 @@ def change_theme(page: Any) -> None:
     """Change between the dark and the light theme."""
     before = ground(page)
     page.keyboard.press("Control+k")
-    page.get_by_label("Action").fill("theme")
+    page.get_by_label("Action", exact=True).fill("theme")
     page.get_by_role("option").filter(has_text="theme").click()
     page.get_by_role("dialog").wait_for(state="detached")
     assert come(lambda: ground(page) != before)
@@ -358,7 +358,7 @@ def test_a_narrow_window_cuts_no_control(tab_of_own: Any, width: int) -> None:
       .filter(([_, box]) => box.left < 0 || box.right > innerWidth + 1).map(([name]) => name)"""
     panel(page, "Log")
     page.set_viewport_size({"width": width, "height": 800})
-    for name in ("Run", "Tracker", "Monte Carlo"):
+    for name in ("Run", "Lights", "Scene", "Monte Carlo"):
         panel(page, name)
         page.wait_for_timeout(500)
         assert page.evaluate(cut) == []

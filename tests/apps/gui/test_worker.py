@@ -20,6 +20,7 @@ from tests.helpers.labpage import (
     chosen,
     come,
     onto_the_page,
+    open_scene,
     opened,
     panel,
     pictured,
@@ -37,9 +38,7 @@ pytestmark = [
 
 def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> None:
     """The flight is computed while keys move the camera; then it plays to its last frame at any speed."""
-    chosen(page, "Scene", "simsat_slew")
-    page.get_by_text("SimSat slews on its reaction wheels").wait_for()
-    status(page, "solved")
+    open_scene(page, "simsat_slew")
     simulate(page, 120)
     page.get_by_text(re.compile(r"^[\d.]+ of [\d.]+ s, \d+ frames$")).wait_for()
     frame = source(page)
@@ -55,11 +54,11 @@ def test_a_dome_flight_is_played_positioned_and_its_loop_opened(page: Any) -> No
     chosen(page, "Speed", "5×")
     onto_the_page(page)
     page.keyboard.press("Control+k")
-    page.get_by_label("Action").fill("play the flight")
+    page.get_by_label("Action", exact=True).fill("play the flight")
     page.get_by_role("option").first.click()
     page.get_by_role("dialog").wait_for(state="detached")
     page.keyboard.press("Control+k")  # draws the list anew, without the row that was clicked
-    page.get_by_label("Action").wait_for()
+    page.get_by_label("Action", exact=True).wait_for()
     page.keyboard.press("Escape")
     clock.filter(has_text="8/8").wait_for()
     page.get_by_text(re.compile(r"^flight at 8\.01 s$")).wait_for()

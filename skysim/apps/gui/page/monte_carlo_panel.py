@@ -33,6 +33,7 @@ from skysim.experiments.study.plan import Plan, TrialSection
 from skysim.scene.loader import load
 
 POLL_S = 0.5
+NO_STUDY = "No study of this scene has been run yet: press 2."
 MODEL = "A trial of centroids takes stars of the catalog with random errors."
 TRIAL_KINDS = {"centroids": "centroids", "frames": "rendered frames"}
 
@@ -68,6 +69,7 @@ class MonteCarloPanel:
             )
             self.study_select.mark("study").on_value_change(self.study_chosen)
             self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
+            self.report = widgets.button("Report", self.open_report, "report")
         with widgets.div("lab-trial") as self.fields:
             self.count = widgets.number(
                 "runs, F8", value=200, min=1, max=100_000, precision=0
@@ -88,9 +90,7 @@ class MonteCarloPanel:
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
             "instant-feedback"
         )
-        self.note = widgets.quiet("No study has been run yet: press 2.").style(
-            "margin-top: 6px"
-        )
+        self.note = widgets.quiet(NO_STUDY).style("margin-top: 6px")
         self.note.mark("trials-note")
         self.chart = (
             ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
@@ -101,6 +101,20 @@ class MonteCarloPanel:
         widgets.quiet("Finished studies")
         self.reports = ui.column().classes("w-full gap-0")
         self.list_reports()
+        page.derive(lambda view: view.study, self.empty)
+
+    def empty(self) -> None:
+        self.show(NO_RESULTS)
+        self.note.set_text(NO_STUDY)
+        self.report.set_enabled(False)
+
+    def open_report(self) -> None:
+        ui.navigate.to(f"/report/{quote(self.process.folder.name)}", new_tab=True)
+
+    @property
+    def running(self) -> str:
+        """Folder of the study that is running, "" if none is."""
+        return self.process.folder.name if self.process.running else ""
 
     def set_scene(self) -> None:
         options = {"": f"Monte Carlo of {Path(self.page.state.scene).stem}"}
@@ -131,7 +145,8 @@ class MonteCarloPanel:
             self.noise.set_value(float(f"{noise_px:.4g}"))
 
     def study_chosen(self) -> None:
-        """Hide the Monte Carlo fields when a study file is chosen."""
+        """Hide the Monte Carlo fields when a study file is chosen, and the results of the study before."""
+        self.page.set_state(study=self.running)
         for item in (self.fields, self.model):
             item.set_visibility(not self.study_select.value)
 
@@ -175,13 +190,9 @@ class MonteCarloPanel:
         if not self.page.is_open:
             return
         self.button.set_text("Start")
-        results = self.process.results()
-        if results:
-            self.show(results)
-        done = results.done if results else 0
         if fault and not self.stopped:
             self.page.show_message(fault)
-        self.show_count(done)
+        done = await self.show_results()
         self.page.log(f"study ended: {done} of {self.process.total} trials")
         self.list_reports()
 
@@ -196,7 +207,7 @@ class MonteCarloPanel:
             self.page.out / path.stem if self.study_select.value else path.parent
         )
         self.process.total = study.trials
-        self.show(NO_RESULTS)
+        self.page.set_state(study=self.process.folder.name)
         self.button.set_text("Stop")
         self.stopped = False
         self.note.set_text("starting …")
@@ -206,7 +217,6 @@ class MonteCarloPanel:
             self.page.show_message(
                 f"trials of {self.kind.value} do not use {', '.join(sorted(unused))}", "quiet"
             )
-        self.page.set_state(study=self.process.folder.name)
         await self.process.start(path)
         if not self.page.is_open:  # the page was closed before there was a process to end
             self.process.stop(signal.SIGTERM)
@@ -280,16 +290,12 @@ class MonteCarloPanel:
             return
         self.process = StudyProcess(folder)
         self.process.total = found.trials
-        self.show(NO_RESULTS)
         self.stopped = True
         self.study_select.set_value(name if (STUDIES / f"{name}.yaml").is_file() else "")
         if not self.study_select.value:
             self.set_fields(name, found)
-        results = await run.io_bound(self.process.results)
         self.page.set_state(study=name)
-        if results:
-            self.show(results)
-            self.show_count(results.done)
+        await self.show_results()
 
     def set_fields(self, name: str, study: Plan) -> None:
         """Fill in the fields with the settings of a Monte Carlo study of this page, so that Start continues it."""
@@ -306,18 +312,24 @@ class MonteCarloPanel:
             self.magnitude.set_value(magnitude_sigma)
         self.false_lights.set_value(trial.get("false_lights", self.false_lights.value))
 
-    def show_count(self, done: int) -> None:
-        """Show the number of finished trials, and how to continue."""
-        rest = "" if done >= self.process.total else "; stopped, Start continues"
-        self.note.set_text(f"{done} of {self.process.total} trials{rest}")
-
     async def poll(self) -> None:
-        """Timer, every POLL_S: read the store of a running study and display its results so far."""
+        """Timer, every POLL_S: show the results of a running study so far."""
         if self.process.running:
-            results = await run.io_bound(self.process.results)
-            if results and self.process.running:
-                self.show(results)
-                self.note.set_text(f"{results.done} of {self.process.total} trials")
+            await self.show_results()
+
+    async def show_results(self) -> int:
+        """Read the study's store, and show its results and how to continue it; return the number of its trials."""
+        process = self.process
+        was_running = process.running
+        results = await run.io_bound(process.results) or NO_RESULTS
+        # Not if the page is on another study by now, or if this was not its end.
+        if self.page.state.study == process.folder.name and was_running == process.running:
+            self.show(results)
+            is_done = results.done >= process.total
+            rest = "" if is_done or was_running else "; stopped, Start continues"
+            self.note.set_text(f"{results.done} of {process.total} trials{rest}")
+            self.report.set_enabled(is_done and not was_running)
+        return results.done
 
     def show(self, results: StudyResults) -> None:
         self.bar.set_value(results.done / max(self.process.total, 1))

@@ -2,6 +2,7 @@
 
 import weakref
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 from nicegui import ui
@@ -10,6 +11,9 @@ from skysim.apps.gui.views import context, widgets
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
 
 LIMIT_BYTES = 64 * 2**20
+NO_IMAGE = (
+    "No image on the page. Images are solved lost in space; uncertain matches are rejected."
+)
 
 
 def weak_handler(method: Callable[[Any], Any]) -> Callable[[Any], Any]:
@@ -65,12 +69,11 @@ class PhotoPanel:
                 widgets.quiet(
                     "No live camera is offered here. Cameras are named when the lab is started."
                 )
-        self.result_text = ui.label(
-            "No image yet. Images are solved lost in space; uncertain matches are rejected."
-        )
+        self.result_text = ui.label(NO_IMAGE)
         self.result_text.classes("mono quiet").style(
             "margin-top: 10px; white-space: pre-wrap"
         ).mark("facts")
+        page.derive(lambda view: view.image, partial(self.show_text, NO_IMAGE, "quiet"))
 
     def rejected(self, _: Any) -> None:
         self.page.show_message(f"refused; allowed: {', '.join(SUFFIXES)}, at most 64 MB")

@@ -1,4 +1,4 @@
-"""Plan panel: the scene's check, ambiguous fields on the dome, and attitudes of a survey, which can be flown."""
+"""Check panel: the scene's check, and ambiguous fields of the dome; Survey panel: attitudes that can be flown."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -39,8 +39,70 @@ UNPLANNED = (
 )
 
 
-class PlanPanel:
-    """Panel with three parts, each computed on request and cleared when the scene changes.
+class CheckPanel:
+    """Panel with two parts, each computed on request and emptied when the scene changes."""
+
+    def __init__(self, page: context.PageContext, scene_3d: space.Scene3D) -> None:
+        self.page = page
+        self.scene_3d = scene_3d
+        with widgets.row():
+            widgets.button("Check", self.check, "check")
+        self.facts = ui.column().classes("w-full gap-1").mark("check-result")
+        with widgets.row().style("margin-top: 8px"):
+            widgets.button("Map", self.map, "map")
+        self.fields = ui.column().classes("w-full gap-1").mark("map-result")
+        self.empty()
+        page.derive(lambda view: view.opened, self.empty)
+
+    def empty(self) -> None:
+        """Show what each part does."""
+        for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
+            column.clear()
+            with column:
+                widgets.quiet(text)
+
+    async def check(self) -> None:
+        found: Check | None = await self.page.run_task(
+            "check", activity="checking the scene …"
+        )
+        if found is None:
+            return
+        self.facts.clear()
+        with self.facts:
+            for finding in found.findings:
+                ui.label(finding).classes("warn").style("overflow-wrap: anywhere")
+            if not found.findings:
+                ui.label("No warnings.").classes("good")
+            with widgets.div("lab-facts"):
+                for fact in found.facts:
+                    widgets.quiet(fact.name)
+                    ui.label("\n".join(fact.lines)).style(
+                        "white-space: pre-line; overflow-wrap: anywhere"
+                    )
+
+    async def map(self) -> None:
+        found: AmbiguityMap | None = await self.page.run_task(
+            "ambiguity", activity="comparing the fields …"
+        )
+        if found is None:
+            return
+        self.fields.clear()
+        with self.fields:
+            ui.label(ambiguity_text(found))
+            with ui.row().classes("no-wrap items-center gap-2") as legend:
+                widgets.quiet(f"{100 * found.least:.0f} % or less")
+                scale = 255 * style.color_scale(np.linspace(0, 1, 8))
+                colors = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in scale)
+                ui.element("div").style(
+                    f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
+                )
+                widgets.quiet("100 % of the LEDs coincide; drawn in the 3-D view")
+        share = (found.fraction - found.least) / (1 - found.least)
+        self.scene_3d.color_lights(found.ids, share, legend)
+
+
+class SurveyPanel:
+    """Panel of a survey, which is continued when its scene is opened again.
 
     Attributes
     ----------
@@ -54,9 +116,8 @@ class PlanPanel:
         Text on the flight that is computed
     colored
         LEDs of the survey, and how well each is known
-    legends
-        Meaning of the LED colors in the 3-D view, by the part that has colored them; the last
-        one is shown
+    legend
+        Meaning of the LED colors in the 3-D view
     """
 
     def __init__(
@@ -65,63 +126,45 @@ class PlanPanel:
         self.page = page
         self.scene_3d = scene_3d
         self.run_panel = run_panel
-        self.legends = dict[str, ui.element]()
-        with self.part():
-            widgets.button("Check", self.check, "check")
-        self.facts = ui.column().classes("w-full gap-1").mark("check-result")
-        with self.part():
-            widgets.button("Map", self.map, "map")
-        self.fields = ui.column().classes("w-full gap-1").mark("map-result")
-        with self.part():
-            self.begin = self.survey_button("Plan", self.plan_survey, "begin a new survey")
+        with widgets.row():
+            self.begin = self.button("Plan", self.plan_survey, "begin a new survey")
             self.frames = widgets.number(value=FRAMES, min=2, step=1, label="frames").classes(
                 "w-24"
             )
-            self.fly = self.survey_button(
-                "Fly", self.fly_plan, "fly the vehicle to these attitudes"
-            )
-            self.adjust_button = self.survey_button(
+            self.fly = self.button("Fly", self.fly_plan, "fly the vehicle to these attitudes")
+            self.adjust_button = self.button(
                 "Adjust",
                 self.adjust,
                 "adjust LEDs, lever and lens to the frames of the last flight and those before",
             )
-            self.save_map = self.survey_button(
+            self.save_map = self.button(
                 "Map file", self.download_map, "save the LEDs for tracker.map"
             )
         self.stops = ui.column().classes("w-full gap-1").mark("survey-result")
         self.set_scene()
+        page.derive(lambda view: view.opened, self.set_scene)
 
-    def part(self) -> ui.row:
-        return widgets.row().style("margin-top: 8px")
-
-    def survey_button(self, label: str, action: Callable[[], Any], title: str) -> ui.button:
+    def button(self, label: str, action: Callable[[], Any], title: str) -> ui.button:
         return widgets.button(label, action).props(f'title="{title}"').classes("flex-none")
 
     def set_scene(self) -> None:
-        """Show what each part does, as there are no results for a new scene; a survey of the scene is continued."""
-        self.legends.pop("map", None)
-        for column, text in ((self.facts, UNCHECKED), (self.fields, UNMAPPED)):
-            column.clear()
-            with column:
-                widgets.quiet(text)
+        """Continue the survey of a scene that is opened again; forget that of another one."""
         info = self.page.scene_info
-        if not (info and info.surveyed):
+        if info and info.surveyed:
+            self.color()
+        else:
             self.clear_survey()
-        elif self.colored:
-            self.color("survey", *self.colored)
 
-    def color(self, by: str, ids: Ints, values: Floats) -> None:
-        """Color LEDs of the 3-D view, and show the meaning of the colors."""
-        self.scene_3d.color_lights(ids, values)
-        for name, legend in self.legends.items():
-            legend.set_visibility(name == by)
+    def color(self) -> None:
+        """Color the LEDs of the 3-D view by how well each is known, if that is determined."""
+        if self.colored:
+            self.scene_3d.color_lights(*self.colored, self.legend)
 
     def clear_survey(self) -> None:
         """Discard the survey, and show what a survey does."""
         self.plan: SurveyPlan | None = None
         self.colored: tuple[Ints, Floats] | None = None
         self.taken = 0
-        self.legends.pop("survey", None)
         self.enable()
         self.save_map.set_enabled(False)
         self.stops.clear()
@@ -144,50 +187,6 @@ class PlanPanel:
         finally:
             if self.page.is_open:
                 self.enable()
-
-    # The check.
-
-    async def check(self) -> None:
-        found: Check | None = await self.page.run_task(
-            "check", activity="checking the scene …"
-        )
-        if found is None:
-            return
-        self.facts.clear()
-        with self.facts:
-            for finding in found.findings:
-                ui.label(finding).classes("warn").style("overflow-wrap: anywhere")
-            if not found.findings:
-                ui.label("No warnings.").classes("good")
-            with widgets.div("lab-facts"):
-                for fact in found.facts:
-                    widgets.quiet(fact.name)
-                    ui.label("\n".join(fact.lines)).style(
-                        "white-space: pre-line; overflow-wrap: anywhere"
-                    )
-
-    # The ambiguity map.
-
-    async def map(self) -> None:
-        found: AmbiguityMap | None = await self.page.run_task(
-            "ambiguity", activity="comparing the fields …"
-        )
-        if found is None:
-            return
-        self.fields.clear()
-        with self.fields:
-            ui.label(ambiguity_text(found))
-            with ui.row().classes("no-wrap items-center gap-2") as self.legends["map"]:
-                widgets.quiet(f"{100 * found.least:.0f} % or less")
-                scale = 255 * style.color_scale(np.linspace(0, 1, 8))
-                colors = ", ".join(f"rgb({r:.0f} {g:.0f} {b:.0f})" for r, g, b in scale)
-                ui.element("div").style(
-                    f"width: 120px; height: 10px; background: linear-gradient(90deg, {colors})"
-                )
-                widgets.quiet("100 % of the LEDs coincide; drawn in the 3-D view")
-        self.color("map", found.ids, (found.fraction - found.least) / (1 - found.least))
-
-    # The survey.
 
     async def plan_survey(self) -> None:
         """Begin a new survey: plan its first attitudes."""
@@ -230,8 +229,7 @@ class PlanPanel:
             if not found.statistics["refusal"]:
                 self.save_map.set_enabled(True)
                 self.colored = found.ids, found.known
-            if self.colored:
-                self.color("survey", *self.colored)
+            self.color()
 
     def show_survey(self, lines: Sequence[str], plan: SurveyPlan) -> None:
         """Show the findings of a survey and its next attitudes, which can then be flown."""
@@ -242,8 +240,8 @@ class PlanPanel:
                 ui.label(line).style("overflow-wrap: anywhere")
             self.progress = ui.label().bind_text_from(self.run_panel.summary, "text")
             self.progress.set_visibility(False)
-            self.legends["survey"] = ui.label(COLORED)
-            self.legends["survey"].set_visibility(False)
+            self.legend = ui.label(COLORED)
+            self.legend.set_visibility(False)
             with widgets.div("lab-stops mono"):
                 for head in ("", "roll °", "pitch °", "yaw °", "LEDs"):
                     ui.label(head).classes("quiet num")

@@ -112,6 +112,8 @@ class RunPanel:
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
         self.strips = StripChart(self.page.contents)
         self.clear()
+        self.page.derive(lambda view: view.opened, self.clear)
+        self.page.derive(lambda view: view.kind == "flight", self.hide_moment)
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
         button = ui.button(icon=icon, on_click=action).props(
@@ -133,7 +135,7 @@ class RunPanel:
         if self.rows or self.computing:
             return
         info = self.page.scene_info
-        self.clock.set_text("")
+        self.hide_moment()
         self.summary.set_text(
             f"No flight yet. Simulate computes the motion of {info.duration_s:.4g} s and every frame of it."
             if info
@@ -141,9 +143,7 @@ class RunPanel:
         )
 
     def set_scene(self, info: SceneInfo) -> None:
-        """Set up the panel for a new scene, which has no flight yet."""
-        self.pause()
-        self.clear()
+        """Set up the panel for a new scene."""
         control = info.scene.motion.control
         self.feedback = control.feedback if control else ""
         has_loop = self.feedback or CONTROL in self.page.state.overrides
@@ -161,6 +161,11 @@ class RunPanel:
         self.bar.set_value(0)
         self.strips.draw([], 1.0, str)
         self.enable()
+
+    def hide_moment(self) -> None:
+        """Show no moment of the flight, as the page does not."""
+        self.clock.set_text("")
+        self.strips.set_moment(math.nan)
 
     async def close_loop(self) -> None:
         """Reopen the scene with another feedback. An opened loop is closed again with the controller of the file."""
@@ -369,10 +374,11 @@ class RunPanel:
         if view is None or index >= len(self.rows):
             return
         t_s = TIME_S(self.rows[index])
+        self.page.set_state(kind="flight", t_s=t_s)
         self.seek.set_value(index)
         self.clock.set_text(f"{t_s:.2f} s  {index + 1}/{len(self.rows)}")
         self.strips.set_moment(t_s)
-        self.page.show_frame(view, kind="flight", t_s=t_s)
+        self.page.show_frame(view)
         await self.page.sensor.wait_drawn()
 
     def download(self) -> None:

@@ -1,6 +1,6 @@
-"""Scene panel, a form of all keys of the scene; Tracker panel, a form of those of image processing and tracker."""
+"""Scene panel: a form of all keys of the scene; F6 and F7 show those of image processing and of identification."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -10,31 +10,30 @@ from skysim.apps.gui.views import context, forms, keys, widgets
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 
-SENSOR = "sensor, F6"
-IDENTIFIER = "identifier, F7"
-NAMES = {  # by group and key
-    SENSOR: {
-        "tracker.detector": "detector",
-        "tracker.centroider": "centroider",
-        "tracker.threshold_sigma": "threshold, σ",
-        "tracker.min_area_px": "least area",
-        "camera.detector.noise": "camera's noise, N",
-        "camera.detector.read_noise_e": "read noise",
-        "light.limit_mag": "faintest star, V",
-    },
-    IDENTIFIER: {
-        "tracker.identifier": "identifier",
-        "tracker.solver": "solver",
-        "tracker.limit_mag": "limiting magnitude",
-        "tracker.catalog": "catalog",
-        "tracker.centroid_sigma_px": "least error",
-        "tracker.brightest": "brightest lights",
-        "tracker.brightness_sigma": "brightness, σ",
-        "tracker.decoder.gate_px": "decoder's gate",
-        "tracker.decoder.frames": "decoder's frames",
-    },
+# Keys that are shown by the name of a key on the keyboard: those of PTASE's settings, without keys that have no effect.
+KEYS_OF = {
+    "F6": (
+        "tracker.detector",
+        "tracker.centroider",
+        "tracker.threshold_sigma",
+        "tracker.min_area_px",
+        "camera.detector.noise",
+        "camera.detector.read_noise_e",
+        "light.limit_mag",
+    ),
+    "F7": (
+        "tracker.identifier",
+        "tracker.solver",
+        "tracker.limit_mag",
+        "tracker.catalog",
+        "tracker.centroid_sigma_px",
+        "tracker.brightest",
+        "tracker.brightness_sigma",
+        "tracker.decoder.gate_px",
+        "tracker.decoder.frames",
+    ),
 }
-FOCUS_S = 0.2  # time until a part that opens is drawn
+FOCUS_S = 0.2  # time until a section that opens is drawn
 
 
 @dataclass
@@ -56,15 +55,15 @@ class KeyRow:
     typed: str
 
 
-class KeyForm:
-    """Form with one expandable part per group of keys; values that differ from the file are marked.
+class ScenePanel:
+    """The form with one part per section of the scene; values that differ from the file are marked.
+
+    It has a search field for keys, and a button to save a new scene file.
 
     Attributes
     ----------
-    label
-        Function that returns the label of a field from its key
-    opens
-        Group that is open at first
+    saved
+        Function that is called when a scene has been saved
     shown
         Scene and overrides in the form; None if the scene has been opened since then
     scene
@@ -72,68 +71,72 @@ class KeyForm:
     rows
         Rows by key
     expansions
-        Expandable parts by group
+        Expandable parts by section
     """
 
     shown: tuple[str, OverrideTexts] | None = None
 
-    def __init__(
-        self,
-        page: context.PageContext,
-        label: Callable[[forms.FormField], str],
-        opens: str = "",
-    ) -> None:
+    def __init__(self, page: context.PageContext, saved: Callable[[], None]) -> None:
         self.page = page
-        self.label = label
-        self.opens = opens
+        self.saved = saved
+        with widgets.row().style("margin-bottom: 8px"):
+            self.find = ui.input(placeholder="find a key", on_change=self.search)
+            self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
+            self.name = ui.input(placeholder="new-name").props(
+                'dense outlined aria-label="Name of the new scene"'
+            )
+            self.name.classes("w-36").mark("save-name")
+            widgets.button("Save as", self.save, "save").props("no-wrap")
+            self.undo = widgets.button("Undo all", self.revert, "revert", "flat").props(
+                "no-wrap"
+            )
+        self.no_match = ui.label("No key contains this text.").classes("w-full empty")
+        self.no_match.set_visibility(False)
         self.parts = ui.column().classes("lab-sections w-full gap-0")
         self.rows: dict[str, KeyRow] = {}
         self.expansions: dict[str, ui.expansion] = {}
         self.scene = ""
-
-    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
-        """Show the fields of the current scene."""
-        raise NotImplementedError
 
     def hide_others(self, scene: str) -> None:
         """Hide the fields of another scene until those of this one are shown: what is typed there would be lost."""
         self.shown = None  # the file of this name may have changed
         self.parts.set_visibility(self.scene == scene)
 
-    def show(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
-        """Show the fields of the current scene. Open groups stay open, and text being typed is kept."""
-        shown = [field for fields in groups.values() for field in fields]
-        same = [(field.key, field.allowed_values) for field in shown] == [
+    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
+        """Show the fields of the current scene. Open sections stay open, and text being typed is kept."""
+        same = [(field.key, field.allowed_values) for field in fields] == [
             (key, row.field.allowed_values) for key, row in self.rows.items()
         ]
         scene = self.page.state.scene
         if self.scene == scene and same:
-            for field in shown:
+            for field in fields:
                 self.update_row(self.rows[field.key], field)
         else:
-            self.build(groups)
+            self.build(fields)
         self.scene = scene
         self.parts.set_visibility(True)
+        self.undo.set_visibility(bool(self.page.state.overrides))
+        self.search()
 
-    def build(self, groups: Mapping[str, Sequence[forms.FormField]]) -> None:
+    def build(self, fields: Sequence[forms.FormField]) -> None:
         open_now = {name for name, expansion in self.expansions.items() if expansion.value}
-        open_now = open_now if self.expansions else {self.opens}
         self.parts.clear()
         self.expansions.clear()
         self.rows.clear()
-        with self.parts:
-            for name, fields in groups.items():
-                box = ui.expansion(name, group=f"keys-{id(self)}", value=name in open_now)
+        for field in fields:
+            name = field.section
+            if name not in self.expansions:
+                with self.parts:
+                    box = ui.expansion(name, group=f"keys-{id(self)}", value=name in open_now)
                 self.expansions[name] = box.classes("w-full").props("dense dense-toggle")
-                with box:
-                    for field in fields:
-                        self.row(field)
+            with self.expansions[name]:
+                self.row(field)
 
     def row(self, field: forms.FormField) -> None:
         edit = partial(self.edit, field.key)
         with ui.row().classes("w-full no-wrap items-start gap-2") as box:
             head = (
-                ui.label(self.label(field))
+                ui.label(field.key.removeprefix(f"{field.section}."))
                 .classes("mono w-48 flex-none ellipsis")
                 .style("padding-top: 6px")
             )
@@ -213,49 +216,19 @@ class KeyForm:
             entry.props(remove="error error-message")
         entry.update()
 
-
-class ScenePanel(KeyForm):
-    """The form with one part per section of the scene, a search field for keys, and a button to save a new scene file.
-
-    Attributes
-    ----------
-    saved
-        Function that is called when a scene has been saved
-    """
-
-    def __init__(self, page: context.PageContext, saved: Callable[[], None]) -> None:
-        self.saved = saved
-        with widgets.row().style("margin-bottom: 8px"):
-            self.find = ui.input(placeholder="find a key", on_change=self.search)
-            self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
-            self.name = ui.input(placeholder="new-name").props(
-                'dense outlined aria-label="Name of the new scene"'
-            )
-            self.name.classes("w-36").mark("save-name")
-            widgets.button("Save as", self.save, "save").props("no-wrap")
-            self.undo = widgets.button("Undo all", self.revert, "revert", "flat").props(
-                "no-wrap"
-            )
-        self.no_match = ui.label("No key contains this text.").classes("w-full empty")
-        self.no_match.set_visibility(False)
-        super().__init__(page, lambda field: field.key.removeprefix(f"{field.section}."))
-
-    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
-        """Show the fields of the current scene."""
-        sections = dict.fromkeys(field.section for field in fields)
-        self.show(
-            {name: [field for field in fields if field.section == name] for name in sections}
-        )
-        self.undo.set_visibility(bool(self.page.state.overrides))
-        self.search()
-
     def search(self) -> None:
-        """Show only keys that contain the search text, and sections with such keys; open the first if none is open."""
-        text = (self.find.value or "").lower()
+        """Show only keys that contain the search text, or those of F6 or F7, and sections with such keys.
+
+        The first one is opened if none is open.
+        """
+        text = self.find.value or ""
         visible = set()
         for key, row in self.rows.items():
-            row.box.set_visibility(text in key.lower())
-            if text in key.lower():
+            is_found = text.lower() in key.lower()
+            if text in KEYS_OF:
+                is_found = key in KEYS_OF[text] and not row.field.no_effect
+            row.box.set_visibility(is_found)
+            if is_found:
                 visible.add(row.field.section)
         for section, expansion in self.expansions.items():
             expansion.set_visibility(section in visible)
@@ -289,31 +262,9 @@ class ScenePanel(KeyForm):
         self.scene = ""  # forces a rebuild, which also removes refused values
         await self.page.open(self.page.state.scene)
 
-
-class TrackerPanel(KeyForm):
-    """The settings of F6 and F7 in PTASE: image processing with the sensor's noise, and identification.
-
-    It is a form of two parts, without keys that have no effect.
-    """
-
-    def __init__(self, page: context.PageContext) -> None:
-        names = {key: name for group in NAMES.values() for key, name in group.items()}
-        super().__init__(page, lambda field: names[field.key], opens=SENSOR)
-
-    def set_scene(self, fields: Sequence[forms.FormField]) -> None:
-        """Show the fields of the current scene."""
-        offered = {field.key: field for field in fields if not field.no_effect}
-        self.show(
-            {
-                group: [offered[key] for key in NAMES[group] if key in offered]
-                for group in NAMES
-            }
-        )
-
-    def open(self, action: str) -> None:
-        """Show the part of an action (sensor or identifier) and focus its first field."""
-        group = SENSOR if action == "sensor" else IDENTIFIER
-        if group in self.expansions:
-            self.expansions[group].open()
-            if row := self.rows.get(next(iter(NAMES[group]))):
-                ui.timer(FOCUS_S, partial(keys.focus, row.entry), once=True)
+    def open(self, name: str) -> None:
+        """Show only the keys of F6 or F7, and focus the first one."""
+        self.find.set_value(name)
+        if row := self.rows.get(KEYS_OF[name][0]):
+            self.expansions["tracker"].open()
+            ui.timer(FOCUS_S, partial(keys.focus, row.entry), once=True)

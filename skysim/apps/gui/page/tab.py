@@ -9,7 +9,6 @@ import asyncio
 import json
 import secrets
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -45,7 +44,7 @@ from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 
 PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
-PANELS = ("Run", "Lights", "Scene", "Tracker", "Plan", "Monte Carlo", "Image", "Log")
+PANELS = ("Run", "Lights", "Scene", "Check", "Survey", "Monte Carlo", "Image", "Log")
 
 
 class Tab(context.PageContext):
@@ -72,6 +71,7 @@ class Tab(context.PageContext):
         self.out = out
         self.cameras = cameras
         self.state = PageView(scene)
+        self.derived = []
         self.contents = widgets.Contents()
         self.editing = asyncio.Lock()
         self.filling = asyncio.Lock()
@@ -162,26 +162,23 @@ class Tab(context.PageContext):
                 with ui.tab_panel("Lights"):
                     self.lights = readouts.LightsPanel(self)
                 with ui.tab_panel("Scene"):
-                    scene_panel = settings_panel.ScenePanel(self, self.head.update_scenes)
+                    self.form = settings_panel.ScenePanel(self, self.head.update_scenes)
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
                     self.run_panel = run_panel.RunPanel(self)
-                with ui.tab_panel("Plan"):
-                    self.plan_panel = plan_panel.PlanPanel(
-                        self, self.scene_3d, self.run_panel
-                    )
+                with ui.tab_panel("Check"):
+                    plan_panel.CheckPanel(self, self.scene_3d)
+                with ui.tab_panel("Survey"):
+                    plan_panel.SurveyPanel(self, self.scene_3d, self.run_panel)
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Monte Carlo"):
                     self.study_panel = monte_carlo_panel.MonteCarloPanel(self)
                 await asyncio.sleep(PAUSE_S)
-                with ui.tab_panel("Tracker"):
-                    self.tracker_panel = settings_panel.TrackerPanel(self)
                 with ui.tab_panel("Image"):
                     self.photo = photo_panel.PhotoPanel(self, self.cameras)
                 with ui.tab_panel("Log"):
                     self.log_panel = readouts.LogPanel(self)
                     self.log = self.log_panel.add
-        self.forms = {"Scene": scene_panel, "Tracker": self.tracker_panel}
         self.tabs.on_value_change(self.fill_form)
 
     def update_lights(self) -> None:
@@ -201,8 +198,8 @@ class Tab(context.PageContext):
             "undo": self.history.undo,
             "live": self.head.go_live,
             "attitude": self.attitude.focus,
-            "sensor": partial(self.set_up_tracker, "sensor"),
-            "identifier": partial(self.set_up_tracker, "identifier"),
+            "sensor": partial(self.set_up_tracker, "F6"),
+            "identifier": partial(self.set_up_tracker, "F7"),
             "runs": self.set_up_study,
             "log": partial(self.show_panel, "Log"),
         }
@@ -244,11 +241,11 @@ class Tab(context.PageContext):
         self.show_panel("Monte Carlo")
         self.study_panel.focus()
 
-    async def set_up_tracker(self, action: str) -> None:
-        """Open the tracker's form at its part for an action (sensor or identifier)."""
-        self.show_panel("Tracker")
+    async def set_up_tracker(self, key: str) -> None:
+        """Open the form at the keys of F6 or F7."""
+        self.show_panel("Scene")
         await self.fill_form()
-        self.tracker_panel.open(action)
+        self.form.open(key)
 
     # The view of the page's address.
 
@@ -330,11 +327,10 @@ class Tab(context.PageContext):
                 )
             return False
         self.scene_info, view = result
-        self.set_state(scene=scene, overrides=overrides)
+        self.set_state(scene=scene, overrides=overrides, study=self.study_panel.running)
         self.set_scene(self.scene_info)
         self.show_frame(view, kind="live", angles_deg=view.angles_deg)
-        for form in self.forms.values():
-            form.hide_others(scene)
+        self.form.hide_others(scene)
         await self.fill_form()
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
         return True
@@ -343,28 +339,35 @@ class Tab(context.PageContext):
         """Show a new scene in all parts of the page."""
         self.head.set_scene(info)
         self.attitude.set_scene(info)
-        self.scene_3d.set_scene(info)
         self.sensor.clear_zoom()
         self.run_panel.set_scene(info)
-        self.plan_panel.set_scene()
         self.study_panel.set_scene()
 
     async def fill_form(self) -> None:
-        """Show the keys of the current scene in the panel of keys that is open; not in others, as it takes a while."""
-        form = self.forms.get(str(self.tabs.value))
+        """Show the keys of the current scene in their panel while it is open, as it takes a while.
+
+        When it is left, the keys of F6 or F7 are no longer the only ones.
+        """
+        if self.tabs.value != "Scene" and self.form.find.value in settings_panel.KEYS_OF:
+            self.form.find.set_value("")
         async with self.filling:
-            while form and self.view and self.is_open and form.shown != self.state.opened:
+            while (
+                self.tabs.value == "Scene"
+                and self.view
+                and self.is_open
+                and self.form.shown != self.state.opened
+            ):
                 current = self.state.opened
                 fields = await run.io_bound(forms.fields, *current)
                 if self.is_open and self.state.opened == current:
-                    form.set_scene(fields)
-                    form.shown = current
+                    self.form.set_scene(fields)
+                    self.form.shown = current
 
     # Contents of the page.
 
     def set_state(self, **changes: Any) -> None:
         """Change fields of the page's view, and the banner."""
-        self.state = replace(self.state, **changes)
+        super().set_state(**changes)
         self.head.set_state(self.state)
 
     def show_frame(self, view: FrameView, **state: Any) -> None:

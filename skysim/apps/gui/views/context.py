@@ -65,6 +65,9 @@ class PageContext:
         Function that adds a line to the log
     end_step
         Function that makes the next change of attitude a step of its own for undo
+    derived
+        For each part that shows something derived from the page's view: a function that returns what it is derived
+        from, and one that empties the part
     """
 
     id: str
@@ -88,6 +91,7 @@ class PageContext:
     contents: widgets.Contents
     log: Callable[[str], None]
     end_step: Callable[[], None]
+    derived: list[tuple[Callable[[PageView], object], Callable[[], None]]]
 
     @property
     def solving(self) -> bool:
@@ -208,8 +212,17 @@ class PageContext:
         """Open a panel by its name."""
         self.tabs.set_value(name)
 
+    def derive(self, source: Callable[[PageView], object], empty: Callable[[], None]) -> None:
+        """Empty a part of the page whenever the view has another source, so that it never shows a former one's data."""
+        self.derived.append((source, empty))
+
     def set_state(self, **changes: Any) -> None:
-        """Change fields of `state`."""
+        """Change fields of `state`, and empty the parts whose source is another one. A scene that is opened is new."""
+        before = self.state
+        self.state = replace(before, **changes)
+        for source, empty in self.derived:
+            if "scene" in changes or source(before) != source(self.state):
+                empty()
 
     def show_frame(self, view: FrameView, **state: Any) -> None:
         """Show a frame of the scene in all views.
@@ -271,6 +284,12 @@ class PageView:
     def opened(self) -> tuple[str, Mapping[str, str]]:
         """The scene and its overrides."""
         return self.scene, self.overrides
+
+    @property
+    def image(self) -> object:
+        """What the image on the page is of: the scene, or else a photograph or the trial of a study."""
+        other = self.study, self.trial, self.photo
+        return self.opened if self.kind in ("live", "flight") else (self.kind, *other)
 
     def query(self) -> str:
         """The view as the query of an address, without default values."""

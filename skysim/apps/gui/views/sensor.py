@@ -184,6 +184,8 @@ class SensorView:
         self.statistics = statistics_text(image, of)
         self.lights = image.lights
         self.result = image.result
+        if self.size_px != image.pixels.fields["size"]:
+            self.hover_px = None
         self.size_px = image.pixels.fields["size"]
         self.pose = image.pose
         is_new_lens = of.lens is not self.lens

@@ -11,7 +11,7 @@ from typing import Any
 import nicegui.elements.scene  # registers three.js with the page  # noqa: F401
 from nicegui import ui
 
-from skysim.apps.gui.messages import FrameView, SceneInfo, Triple
+from skysim.apps.gui.messages import FrameView, Triple
 from skysim.apps.gui.views import context, style, widgets
 from skysim.apps.gui.worker.geometry import Grip
 from skysim.core.types import Floats, Ints
@@ -31,12 +31,14 @@ class Space(ui.element, component="js/space.js", esm={"skysim-views": "js"}):  #
 
 
 class Scene3D:
-    """The view and its buttons. `set_scene` builds it; `show` sets the attitude, which is sent a little later.
+    """The view and its buttons. `build` builds it; `show` sets the attitude, which is sent a little later.
 
     Attributes
     ----------
     newest_view
         Newest frame, which is not sent yet
+    legend
+        Meaning of the lights' colors
     waits
         Whether `update` will be called
     """
@@ -44,6 +46,7 @@ class Scene3D:
     def __init__(self, page: context.PageContext) -> None:
         self.page = page
         self.newest_view: FrameView | None = None
+        self.legend: ui.element | None = None
         self.waits = False
         self.canvas = Space().classes("w-full h-full").mark("space")
         with widgets.div("lab-looks"):
@@ -59,21 +62,36 @@ class Scene3D:
         )
         hint.classes("lab-turn")
         self.push = PushControl(page, self.canvas, self.update)
+        page.derive(lambda view: view.image, self.forget)
+        page.derive(lambda view: view.opened, self.build)
 
     def look(self, name: str) -> None:
         """Look from a preset place, also to reset a view that the user has turned."""
         self.canvas.run_method("look", name)
 
-    def set_scene(self, scene_info: SceneInfo) -> None:
-        fields = {"background": style.DARK["ground"], "prefix": scene_info.prefix}
-        self.canvas.run_method("build", scene_info.geometry | fields)
+    def build(self) -> None:
+        """Show the laboratory of a new scene."""
+        self.legend = None
+        info = self.page.scene_info
+        if info:
+            fields = {"background": style.DARK["ground"], "prefix": info.prefix}
+            self.canvas.run_method("build", info.geometry | fields)
 
-    def color_lights(self, ids: Ints, values: Floats) -> None:
-        """Color some lights by values from 0 to 1, until the scene changes."""
+    def color_lights(self, ids: Ints, values: Floats, legend: ui.element) -> None:
+        """Color some lights by values from 0 to 1, until the scene changes; show the meaning of only these colors."""
+        if self.legend and not self.legend.is_deleted:
+            self.legend.set_visibility(False)
+        self.legend = legend
+        legend.set_visibility(True)
         colors = (
             f"rgb({r:.0f},{g:.0f},{b:.0f})" for r, g, b in 255 * style.color_scale(values)
         )
         self.canvas.run_method("color", list(zip(ids, colors, strict=True)))
+
+    def forget(self) -> None:
+        """Mark no lights: those of the last frame are not in the image on the page."""
+        self.newest_view = None
+        self.canvas.run_method("show", {"seen": [], "identified": []})
 
     def show(self, view: FrameView) -> None:
         """Send the attitude after a delay, so that of many frames in a short time only the last one is sent."""

@@ -71,7 +71,7 @@ body.body--light .lab-bar .q-checkbox__label {{ filter: brightness(.5) }}
 body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   font: 13px/1.45 Inter, system-ui, sans-serif }}
 .nicegui-content {{ padding: 0; gap: 0; height: 100vh; overflow: hidden }}
-.lab {{ display: grid; width: 100vw; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
+.lab {{ display: grid; width: 100%; height: 100vh; grid-template-rows: 44px minmax(0, 1fr) 30px;
   grid-template-columns: minmax(0, 1fr) min(var(--lab-side, clamp(430px, 36vw, 660px)), 70vw);
   grid-template-areas: "head head" "sensor side" "keys keys" }}
 .lab-head {{ grid-area: head }} .lab-sensor {{ grid-area: sensor }} .lab-side {{ grid-area: side }}
@@ -83,7 +83,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   text-overflow: ellipsis; white-space: nowrap; border: 1px solid {COLORS["line"]}; color: {COLORS["quiet"]} }}
 .lab-banner:is([data-state=flight], [data-state=replay], [data-state=photo]) {{
   border-color: {COLORS["warn"]}; color: {COLORS["warn"]} }}
-.lab-title {{ flex: 0 1 auto; min-width: 0; max-width: 32% }} .lab-rate {{ width: 56px; text-align: right }}
+.lab-scene {{ flex: 0 1 330px; min-width: 0 }} .lab-rate {{ width: 56px; text-align: right }}
 .lab-said {{ flex: 1 1 0; min-width: 0; text-align: right; line-height: 1.3; max-height: 2.6em; overflow: hidden;
   display: -webkit-box; -webkit-box-orient: vertical; -webkit-line-clamp: 2; overflow-wrap: anywhere }}
 .lab-busy, .lab-rate, .lab-head .q-btn, .lab-head .q-toggle {{ flex: none }}
@@ -97,6 +97,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-view {{ display: grid; grid-template: minmax(0, 1fr) 24px 176px / minmax(0, 1fr); min-width: 0; min-height: 0 }}
 .lab-frame {{ position: relative; min-height: 0; min-width: 0; margin: 0 14px; overflow: hidden }}
 .lab-frame > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; cursor: crosshair }}
+.lab-frame > canvas:focus-visible {{ outline-offset: -2px }}
 .lab-wait {{ position: absolute; inset: 0; display: flex; flex-direction: column; align-items: center; gap: 16px;
   justify-content: center; white-space: pre-line; text-align: center; line-height: 1.8; color: {COLORS["quiet"]};
   background: {COLORS["ground"]} }}
@@ -114,11 +115,12 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-under .mono {{ white-space: pre-wrap; font-size: 11px; line-height: 1.35 }} }}
 .lab-under > * {{ min-width: 0; overflow: hidden }}
 .lab-loupe {{ width: 252px; height: 160px; outline: 1px dashed {COLORS["line"]} }}
-.lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize }}
+.lab-plot {{ width: 100%; height: 160px; touch-action: none; cursor: ew-resize; background: {DARK["ground"]} }}
+.lab-unseen {{ position: absolute; width: 1px; height: 1px; overflow: hidden; clip-path: inset(50%) }}
 .lab-facts {{ display: grid; grid-template-columns: 128px minmax(0, 1fr); gap: 4px 12px }}
 .lab-stops {{ display: grid; grid-template-columns: 40px repeat(4, minmax(0, 1fr)); gap: 0 10px; align-items: center }}
 .lab-stops .num {{ text-align: right }}
-.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
+.lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-panels .q-tab-panel > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
 .lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
@@ -135,10 +137,12 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
+.lab-lights {{ font-size: 11.5px }} .lab-lights th {{ white-space: normal }}
+.lab-lights tr > * {{ padding-left: 7px }} .lab-lights tr > :is(:first-child, :last-child) {{ width: 18%; max-width: 0;
+  overflow: hidden; text-overflow: ellipsis }}
 .lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
 .lab-turn {{ position: absolute; left: 8px; bottom: 6px; font-size: 11px; pointer-events: none; color: #aab3c2;
   background: #0d1015b0; padding: 0 4px }}
-.stale {{ opacity: .45 }}
 .lab-side {{ display: grid; grid-template: auto minmax(0, 1fr) / minmax(0, 1fr);
   border-left: 1px solid {COLORS["line"]}; min-height: 0; min-width: 0; background: {COLORS["panel"]} }}
 .lab-side {{ position: relative }}
@@ -196,14 +200,16 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .q-tab {{ min-height: 34px; padding: 0 6px; text-transform: none }}
 .q-tabs {{ min-height: 34px }}
 .q-btn {{ text-transform: none }} .q-btn .q-btn__content {{ font-size: 12px; line-height: 1.5 }}
-.lab-sections .q-item {{ padding: 2px 0 }}
+.lab-sections .q-item {{ padding: 2px 0 }} .lab-sections .given {{ font-weight: 600 }}
+.lab-sections .warn::before {{ content: "* " }}
 .q-field--borderless.q-field--focused, :focus-visible {{ outline: 2px solid {COLORS["accent"]}; outline-offset: 1px }}
 @media (max-width: 1000px) {{
   .nicegui-content {{ overflow: auto }}
   .lab {{ height: auto; grid-template: auto auto auto auto / minmax(0, 1fr);
     grid-template-areas: "head" "sensor" "side" "keys" }}
-  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab-title, .lab .lab-split {{ display: none }}
-  .lab-said {{ text-align: left; flex-basis: 200px }}
+  .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab .lab-split {{ display: none }}
+  .lab-scene {{ flex: 1 1 150px }}
+  .lab-said {{ text-align: left; flex-basis: 120px }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto calc(min(70vh, 75vw) + 200px) }}
   .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}

@@ -12,7 +12,10 @@ const PLOT_MS = 250; // between histograms while frames follow one another
 const LARGEST_PX = 60; // screen pixels of an enlarged pixel
 const REACH_PX = 14; // screen pixels within which the cursor finds a light
 const LOUPE = { across: 11, down: 7 };
-const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 45%)", CUT = "#ff8fd0", CROSS = "#dd5a60", NAME = "#6ff0d8";
+const PALE = "#ffe27a", GRID = "rgb(127 160 200 / 62%)", CUT = "#ff8fd0", CROSS = "#dd5a60", NAME = "#6ff0d8";
+
+const HINT = "arrow keys: from light to light, the brightest first · Enter: its data · Esc: the camera's keys again";
+const STEPS = { ArrowRight: 1, ArrowDown: 1, ArrowLeft: -1, ArrowUp: -1 };
 
 const numberOf = (src) => Number(src.slice(src.lastIndexOf("/") + 1));
 
@@ -20,8 +23,10 @@ export default {
   template: `
     <div class="lab-view">
       <div class="lab-frame">
-        <canvas ref="frame" role="img" @wheel.prevent="wheel" @pointerdown="press" @pointermove="move"
-          @pointerup="release" @pointercancel="release" @pointerleave="leave" @dblclick="fit"></canvas>
+        <canvas ref="frame" role="application" tabindex="0" :aria-description="hint" @wheel.prevent="wheel"
+          @mousedown.prevent @pointerdown="press" @pointermove="move" @pointerup="release" @pointercancel="release"
+          @pointerleave="leave" @dblclick="fit" @focus="enter" @blur="exit" @keydown="key"></canvas>
+        <div ref="said" class="lab-unseen" aria-live="polite"></div>
         <slot name="wait"></slot>
       </div>
       <div class="lab-readout">
@@ -41,6 +46,9 @@ export default {
   created() {
     // Not reactive: Vue must not watch arrays of a million pixels.
     Object.assign(this, {
+      hint: HINT,
+      stepping: false, // whether the frame has the focus, by the Tab key, so that the arrow keys step from light to light
+      stop: -1, // index of the light of the last step
       wanted: null, // the newest view: src, and other marks than those that come with it: size, saturation, pose, label,
       // marks, names, lights
       drawn: null, // the view on the canvas, with its pixels, all or fewer
@@ -302,7 +310,7 @@ export default {
       pen.fillStyle = "#000";
       pen.fillRect(0, 0, ...window);
       this.paintPixels(pen);
-      pen.strokeStyle = "#252c38";
+      pen.strokeStyle = "#56606f";
       pen.lineWidth = 1;
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
       if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
@@ -394,7 +402,7 @@ export default {
       const readout = this.$refs.readout, at = this.cursor ?? this.pinned;
       const [x, y] = at ? at.map(Math.round) : [0, 0], dn = at && this.value(x, y);
       if (dn === null) {
-        readout.textContent = "wheel: zoom · drag: pan · shift-drag: cut · double-click: whole frame";
+        readout.textContent = this.stepping ? HINT : "wheel: zoom · drag: pan · shift-drag: cut · double-click: whole frame";
         return;
       }
       const number = this.drawn.pixels.step === 1 ? dn.toFixed(0) : dn.toFixed(2);
@@ -417,6 +425,7 @@ export default {
       this.paint();
     },
     press(event) {
+      document.activeElement.blur();
       if (!this.drawn || event.button !== 0) return;
       this.$refs.frame.setPointerCapture(event.pointerId);
       const { left, top, scale } = this.placed, [width, height] = this.drawn.size;
@@ -491,6 +500,53 @@ export default {
       this.cursor = null;
       this.hover(null);
       this.paintUnder();
+    },
+
+    // Keyboard on the frame.
+
+    enter() {
+      this.stepping = true;
+      this.paintUnder();
+    },
+    exit() {
+      this.stepping = false;
+      this.leave();
+    },
+    key(event) {
+      if (!this.stepping || !this.drawn) return;
+      if (event.key === "Escape") this.$refs.frame.blur();
+      else if (event.key === "Enter") this.tell();
+      else if (STEPS[event.key]) this.step(STEPS[event.key]);
+      else return;
+      event.preventDefault();
+      event.stopPropagation(); // the camera stays
+    },
+    // Show the next light, or the one before: true lights, then detections of none of them.
+    step(by) {
+      const { lights, names } = this.drawn, own = new Set(lights.filter((light) => !light[3]).map((light) => light[2]));
+      const stops = lights.filter((light) => !light[3] || !own.has(light[2])), count = stops.length;
+      if (!count) return this.say("no lights");
+      this.stop = this.stop < 0 && by < 0 ? count - 1 : (this.stop + by + count) % count;
+      const [x, y, id] = stops[this.stop];
+      this.cursor = [x, y];
+      if (this.zoom) this.zoom = { ...this.zoom, x: x + 0.5, y: y + 0.5 };
+      this.hoverKey = `${x} ${y}`;
+      this.mark(stops[this.stop], id);
+      window.dispatchEvent(new CustomEvent("skysim-hover", { detail: { id: id >= 0 ? id : null } }));
+      this.complete();
+      const found = lights.find((light) => light[3] && light[2] === id && id >= 0);
+      const name = found && names.find(([a, b]) => a === found[0] && b === found[1])?.[2];
+      const what = id < 0 ? "no light" : `${name ?? id}${found ? ", identified" : ""}`;
+      this.say(`${this.stop + 1} of ${count}: ${what}, x ${x}, y ${y}`);
+    },
+    // Keep the light in the loupe, and say its data.
+    tell() {
+      this.pinned = this.cursor ?? this.pinned;
+      this.say(this.$el.querySelector(".lab-under .mono").textContent);
+      this.paint();
+    },
+    say(text) {
+      this.$refs.said.textContent = text;
     },
 
     // Mouse on the histogram: its two lines are the limits.

@@ -1,7 +1,7 @@
 // The lights as round points, each with the size and color of its state.
 import { THREE } from "nicegui-scene";
 
-const COLORS = { dark: 0x3a4250, lit: 0xfff3dc, seen: 0xffab1a, identified: 0x1fc9a0, ringed: 0xffffff };
+const COLORS = { dark: 0x626d80, lit: 0xfff3dc, seen: 0xffab1a, identified: 0x1fc9a0, ringed: 0xffffff };
 const SIZES = { dark: 0.7, lit: 1, seen: 1.8, identified: 2.2, colored: 3.2, ringed: 4 }; // over a light's own radius
 const LEAST_PX = 1.5, MOST_PX = 40; // diameter on the screen
 const FORWARD_M = 0.03; // towards the eye, so that the dome's skin does not cover a part of them

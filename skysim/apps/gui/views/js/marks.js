@@ -53,9 +53,10 @@ function stampOf(kind, color) {
 }
 
 // Names without overlap: to the right, left, above or below of a light, or none. Earlier lights choose first.
-export function drawNames(pen, names, toScreen, [width, height], color) {
+// kept: boxes [left, top, right, bottom] that stay free
+export function drawNames(pen, names, toScreen, [width, height], color, kept = []) {
   pen.font = `${FONT}px ui-monospace, monospace`;
-  const taken = names.map(([x, y]) => around(toScreen(x, y), 0.9 * SIZE));
+  const taken = [...kept, ...names.map(([x, y]) => around(toScreen(x, y), 0.9 * SIZE))];
   for (const [x, y, name] of names) {
     const [left, base] = toScreen(x, y), gap = 2.1 * SIZE, wide = LETTER * FONT * name.length;
     if (left < 0 || base < 0 || left > width || base > height) continue;

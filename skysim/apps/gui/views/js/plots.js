@@ -1,7 +1,7 @@
 // The plot under the frame: a histogram with the two display limits, or the profile of a cut.
 
 const MARGIN = { left: 4, right: 4, top: 16, bottom: 16 };
-const QUIET = "#8b95a5", BAR = "#46566e", LIMIT = "#f0b429";
+const QUIET = "#8b95a5", BAR = "#62758f", LIMIT = "#f0b429";
 
 // The axis is an inverse hyperbolic sine about the sky, in units of its scatter, see `histogram` in worker/pixels.py.
 const AXIS_MARGIN = 0.3;

@@ -75,12 +75,13 @@ export default {
       this.paintLights();
       this.look(this.preset);
     },
-    // The newest frame: { wxyz: lab_from_body, seen: numbers on the frame, identified: [number, name] each }.
+    // The newest frame: { wxyz: lab_from_body, seen: numbers on the frame, identified: [number, name] each }. Without an
+    // attitude the vehicle stays.
     show({ wxyz, seen, identified }) {
       const fields = JSON.stringify([wxyz, seen, identified]);
       if (!this.vehicle || fields === this.newest) return;
       this.newest = fields;
-      this.vehicle.quaternion.set(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
+      if (wxyz) this.vehicle.quaternion.set(wxyz[1], wxyz[2], wxyz[3], wxyz[0]);
       this.lights.setFrame(new Set(seen), new Set(identified.map(([id]) => id)));
       const index = new Map(this.lab.lights.id.map((id, n) => [id, n]));
       this.named = identified.filter(([id]) => index.has(id)).map(([id, name]) => [index.get(id), name]);
@@ -163,7 +164,14 @@ export default {
       [canvas.width, canvas.height] = [clientWidth * devicePixelRatio, clientHeight * devicePixelRatio];
       pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
       const names = this.named.map(([n, name]) => [...this.place(n), name]).filter(([x]) => x !== null);
-      drawNames(pen, names, (x, y) => [x, y], [clientWidth, clientHeight], "#6ff0d8");
+      drawNames(pen, names, (x, y) => [x, y], [clientWidth, clientHeight], "#6ff0d8", this.overlaid());
+    },
+    // Boxes of the buttons and texts over the view.
+    overlaid() {
+      const { left, top } = this.$el.getBoundingClientRect();
+      return [this.$refs.label, ...this.$el.parentElement.querySelectorAll(".lab-looks > *, .lab-turn, .lab-push")]
+        .map((one) => one.getBoundingClientRect())
+        .map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top]);
     },
     // Where a light is on the screen; null behind the eye.
     place(n) {
