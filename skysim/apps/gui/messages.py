@@ -78,14 +78,20 @@ NO_LIGHTS: Lights = np.recarray(0, LIGHT)
 
 @frozen
 class Detection:
-    """A detection: pixel, standard error, flux; id of the matched light (-1: none) and its residual in pixels."""
+    """A detection: pixel, standard error, flux; id of the matched light (-1: none).
+
+    Attributes
+    ----------
+    residual_px
+        Along x and y, detected minus predicted by the tracker's attitude; NaN without a matched light
+    """
 
     x: float
     y: float
     sigma_px: float
     flux: float
     id: int = -1
-    residual_px: float = NAN
+    residual_px: tuple[float, float] = (NAN, NAN)
 
 
 def places_px(detections: Collection[Detection]) -> Floats:
@@ -236,9 +242,19 @@ class FlightRow(NamedTuple):
     innovation_arcsec: float
 
 
-Residual = tuple[
-    float, int, float
-]  # of an identified light: time, its number, residual in pixels
+class Residual(NamedTuple):
+    """Residual of an identified light in a frame: time, number of the light, absolute value in pixels.
+
+    Attributes
+    ----------
+    lab_px
+        The residual along the axes of the lab frame, in which a wrong place of a light is constant
+    """
+
+    t_s: float
+    id: int
+    px: float
+    lab_px: Triple
 
 
 class FlightStep(NamedTuple):

@@ -329,7 +329,7 @@ LIGHTS = np.rec.fromarrays(
     ],
     LIGHT,
 )
-SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
+SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, (0.1, 0.0)), Detection(80.0, 80.0, 0.1, 1.0))
 
 
 def test_each_kind_of_mark_has_its_position_and_can_be_switched_off() -> None:

@@ -121,7 +121,7 @@ class SensorView:
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")
             self.limits = self.select("Limits", LIMITS, "w-24")
-            self.colors = self.select("Colors", list(COLOR_MAPS), "w-24")
+            self.colors = self.select("Colors", list(COLOR_MAPS), "w-20")
 
     def select(self, name: str, options: Collection[str], width: str) -> ui.select:
         """A list of display settings."""
@@ -210,7 +210,8 @@ class SensorView:
     def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
         view = {"pose": self.pose, "label": self.description()}
-        return view | overlay.marks(self.lights, self.result, self.shown, self.name)
+        marks = overlay.marks(self.lights, self.result, self.shown, self.name)
+        return view | marks | overlay.arrows(self.result, self.shown, self.size_px[0])
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""
@@ -261,11 +262,8 @@ class SensorView:
             ]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
-            residual = (
-                ""
-                if math.isnan(detection.residual_px)
-                else f"   residual {detection.residual_px:.3f} px"
-            )
+            residual_px = math.hypot(*detection.residual_px)
+            residual = "" if math.isnan(residual_px) else f"   residual {residual_px:.3f} px"
             lines += [
                 f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px",
                 f"           {identity}",

@@ -93,7 +93,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-keys kbd, .lab-command kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px;
   padding: 1px 5px; font: 11px ui-monospace, monospace; margin-right: 5px }}
 .lab-sensor {{ display: grid; grid-template-rows: auto minmax(0, 1fr); min-width: 0; min-height: 0 }}
-.lab-bar {{ display: flex; flex-wrap: wrap; align-items: center; gap: 0 8px; padding: 2px 14px; min-width: 0 }}
+.lab-bar {{ display: flex; flex-wrap: wrap; align-items: center; gap: 0 4px; padding: 2px 14px; min-width: 0 }}
+.lab-bar .q-checkbox__label {{ font-size: 12.5px }}
 .lab-view {{ display: grid; grid-template: minmax(0, 1fr) 24px 176px / minmax(0, 1fr); min-width: 0; min-height: 0 }}
 .lab-frame {{ position: relative; min-height: 0; min-width: 0; margin: 0 14px; overflow: hidden }}
 .lab-frame > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; cursor: crosshair }}

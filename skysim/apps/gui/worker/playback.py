@@ -116,11 +116,12 @@ class Playback:
         self.reported = len(self.frames)
         rows: list[FlightRow] = []
         drawn: Curves | None = None
+        mount = self.bench.lab.camera.mount
         if is_done or new:
             log = self.flight.telemetry()
-            rows = [frame_row(frame, log, self.bench.lab.camera.mount) for frame in new]
+            rows = [frame_row(frame, log, mount) for frame in new]
             drawn = curves(log)
-        residuals = [one for frame in new for one in light_residuals(frame.view)]
+        residuals = [one for frame in new for one in light_residuals(frame.view, mount)]
         flight = self.flight
         return FlightStep(is_done, flight.now_s, flight.duration_s, rows, drawn, residuals)
 
@@ -193,12 +194,16 @@ def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
     return FlightRow(result.row, len(view.lights), filter_arcsec, innovation_arcsec)
 
 
-def light_residuals(view: FrameView) -> Iterator[Residual]:
+def light_residuals(view: FrameView, mount: Mount) -> Iterator[Residual]:
     """The residual of every light that is identified in a frame."""
     assert view.result is not None
+    lab_from_cam = quaternion.to_rotation(view.body_wxyz) * mount.cam_from_body.inv()
+    across_lab = lab_from_cam.as_matrix()[:, :2]  # directions of x and y
     for spot in view.result.detections:
-        if spot.id >= 0 and math.isfinite(spot.residual_px):
-            yield view.result.row.t_s, spot.id, spot.residual_px
+        px = math.hypot(*spot.residual_px)
+        if spot.id >= 0 and math.isfinite(px):
+            lab_px = tuple((across_lab @ spot.residual_px).tolist())
+            yield Residual(view.result.row.t_s, spot.id, px, lab_px)
 
 
 def curves(log: Telemetry) -> Curves:

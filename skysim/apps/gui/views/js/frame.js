@@ -2,7 +2,7 @@
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
 import { setContents } from "skysim-views/live.js";
 import { colorTable, decode, palette, profile, reader, shadeTable } from "skysim-views/pixels.js";
-import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-views/marks.js";
+import { drawArrows, drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-views/marks.js";
 import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-views/plots.js";
 import { directionText, gridLines } from "skysim-views/sky.js";
 
@@ -307,6 +307,7 @@ export default {
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
       if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
       drawMarks(pen, marks, this.toScreen);
+      drawArrows(pen, this.drawn, this.toScreen, window);
       drawNames(pen, names, this.toScreen, window, NAME);
       if (this.cut) this.paintCut(pen);
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
@@ -314,6 +315,7 @@ export default {
       canvas.dataset.frame = this.drawn.src;
       canvas.dataset.whole = this.drawn.isWhole;
       canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(6)).join(" ");
+      canvas.dataset.arrows = this.drawn.arrows_text ?? "";
       canvas.dataset.ringed = ringed ? ringed[2] : "";
       canvas.ariaLabel = this.drawn.label;
       this.paintUnder();

@@ -86,6 +86,27 @@ export function write(pen, text, [x, y], color) {
   pen.fillText(text, x, y);
 }
 
+// Residuals: arrows [x, y, along x, along y, whether it is shortened], and their scale in words at the lower edge.
+const ARROW = "#ffff96", SHORTENED = "#ffab1a", HEAD = 4;
+export function drawArrows(pen, { arrows = [], arrows_text: text }, toScreen, [width, height]) {
+  for (const [x, y, dx, dy, isShortened] of arrows) {
+    const from = toScreen(x, y), to = toScreen(x + dx, y + dy), turn = Math.atan2(to[1] - from[1], to[0] - from[0]);
+    const barbs = [2.6, -2.6].map((side) => [to[0] + HEAD * Math.cos(turn + side), to[1] + HEAD * Math.sin(turn + side)]);
+    for (const [color, wide] of [["rgb(13 16 21 / 80%)", 3.6], [isShortened ? SHORTENED : ARROW, 1.6]]) {
+      pen.strokeStyle = color;
+      pen.lineWidth = wide;
+      pen.beginPath();
+      pen.moveTo(...from);
+      pen.lineTo(...to);
+      pen.moveTo(...barbs[0]);
+      pen.lineTo(...to);
+      pen.lineTo(...barbs[1]);
+      pen.stroke();
+    }
+  }
+  if (text) write(pen, text, [6, height - 6], ARROW);
+}
+
 export function drawGrid(pen, lines, toScreen, [width, height], color) {
   pen.strokeStyle = color;
   pen.lineWidth = 1;
