@@ -18,6 +18,10 @@ NAN = float("nan")
 LIMITS = ("automatic", "zscale", "min to max", "manual")
 
 
+# Pictures of a real frame and the rendered one.
+REAL_VIEWS = ("real", "simulated", "difference", "overlay")
+
+
 class Display(NamedTuple):
     """How the browser draws frames.
 

@@ -783,7 +783,7 @@ def test_a_session_answers_refuses_bad_input_and_ends_with_its_tab() -> None:
             with pytest.raises(InputError, match=r"x\.exe: allowed"):
                 await session.run("solve_file", "x.exe", b"MZ", None)
             with pytest.raises(InputError, match="no camera found"):
-                await session.run("solve_camera", "nowhere.avi", None)
+                await session.run("solve_next", "nowhere.avi", None)
         finally:
             session.close()
         assert not session.process.is_alive()

@@ -66,6 +66,8 @@ class Photo:
         True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     hint
         Likely cause of a refusal, or assumption about a solved file
+    name
+        Name of the file, or of the camera
     """
 
     result: TrackerResult
@@ -80,6 +82,7 @@ class Photo:
     lights: Lights = field(default_factory=lambda: NO_LIGHTS)
     prefix: str = "HIP"
     hint: str = ""
+    name: str = "camera"
 
 
 UNKNOWN = (math.nan,) * 3

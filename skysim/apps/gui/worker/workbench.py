@@ -277,13 +277,11 @@ def predicted_lights(
     If the solution has its own camera (the field of view was fitted), that camera is used.
     """
     assert attitude.cam_from_ref is not None
+    camera = attitude.camera or estimator.camera
     if isinstance(estimator, DomeTracker):
         body_from_lab = estimator.lever.cam_from_body.inv() * attitude.cam_from_ref
         places = estimator.leds.position_m
-        return estimator.leds.id, project(
-            body_from_lab, places, estimator.lever, estimator.camera
-        )
-    camera = attitude.camera or estimator.camera
+        return estimator.leds.id, project(body_from_lab, places, estimator.lever, camera)
     return estimator.stars.id, camera.pixels(
         attitude.cam_from_ref.apply(estimator.stars.vectors)
     )
