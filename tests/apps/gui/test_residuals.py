@@ -25,12 +25,10 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import Detection, Residual
+from skysim.apps.gui.messages import Residual
 from skysim.apps.gui.page import residuals
-from skysim.apps.gui.views import overlay
 from skysim.apps.gui.worker.playback import Playback
 from skysim.apps.gui.worker.workbench import Workbench
-from tests.helpers.solutions import solution
 
 pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
@@ -56,14 +54,14 @@ def test_the_mean_residual_of_an_led_points_to_its_true_place() -> None:
     while not (step := playing.advance(1.0)).is_done:
         found += step.residuals
     found += step.residuals
-    means = residuals.by_light(found)
-    assert np.all(np.diff(means.length_px) <= 0)
+    ids, _, means_px, _ = residuals.by_light(found)
+    assert np.all(np.diff(np.linalg.norm(means_px, axis=1)) <= 0)
     sources = bench.lab.camera.sources
     true_m = dict(zip(sources.id.tolist(), sources.place[:, :3], strict=True))
     leds = bench.estimator.leds  # type: ignore[union-attr]
     map_m = dict(zip(leds.id.tolist(), leds.position_m, strict=True))
     cosines = []
-    for id, mean_px in zip(means.ids.tolist()[:12], means.mean_px, strict=False):
+    for id, mean_px in zip(ids.tolist()[:12], means_px, strict=False):
         error_m = true_m[id] - map_m[id]
         cosines.append(error_m @ mean_px / np.linalg.norm(error_m) / np.linalg.norm(mean_px))
     assert np.median(cosines) > 0.7
@@ -78,31 +76,36 @@ def test_mean_and_scatter_of_a_light_are_those_of_its_draws() -> None:
         for id, vectors in draws.items()
         for n, vector in enumerate(vectors)
     ] + [Residual(0.0, 7, 0.0, (0.0, 0.0, 1.0))]
-    means = residuals.by_light(found)
-    assert means.ids.tolist() == [3, 7, 1, 2]
-    assert means.frames.tolist() == [400, 1, 400, 400]
-    np.testing.assert_allclose(means.mean_px[0], [0.0, -3.0, 4.0], rtol=0, atol=0.02)
+    ids, frames, mean_px, scatter_px = residuals.by_light(found)
+    assert ids.tolist() == [3, 7, 1, 2]
+    assert frames.tolist() == [400, 1, 400, 400]
+    np.testing.assert_allclose(mean_px[0], [0.0, -3.0, 4.0], rtol=0, atol=0.02)
     # Three axes, each with the draws' standard deviation.
-    np.testing.assert_allclose(means.scatter_px[[0, 2, 3]], 0.1 * 3**0.5, rtol=0.1)
-    table = list(residuals.rows(means, "LED {}".format))
-    assert [row["state"] for row in table] == ["warn", "quiet", "warn", "quiet"]
-    assert table[1]["cells"] == ["LED 7", "1", "1", "–", "–"]
-    assert residuals.by_light(()).ids.size == 0
+    np.testing.assert_allclose(scatter_px[[0, 2, 3]], 0.1 * 3**0.5, rtol=0.1)
+    assert np.isnan(scatter_px[1])
+    assert len(residuals.by_light(())[0]) == 0
 
 
-def test_a_wrong_match_neither_scales_nor_covers_the_other_arrows() -> None:
-    small = [Detection(10 * n, 20, 0.1, 5, n, (0.03, 0.04)) for n in range(9)]
-    alone = overlay.arrows(solution(small), overlay.KINDS, 1000)
-    both = overlay.arrows(
-        solution([*small, Detection(500, 500, 0.1, 5, 99, (0.0, 300.0))]), overlay.KINDS, 1000
-    )
-    assert alone["arrows"] == both["arrows"][:9]
-    assert alone["arrows"][1] == [10.0, 20.0, 15.0, 20.0, False]
-    assert alone["arrows_text"] == "arrows × 500, median 0.05 px of 9"
-    assert both["arrows"][9] == [500.0, 500.0, 0.0, overlay.LONGEST * 25.0, True]
-    assert both["arrows_text"].endswith("of 10; 1 shortened, up to 300 px")
-    assert overlay.arrows(None, overlay.KINDS, 1000)["arrows"] == []
-    assert overlay.arrows(solution(small), {"truth"}, 1000)["arrows"] == []
+SCALE_JS = """async ([lengths, wanted]) => {
+  const { arrowScale } = await import("skysim-views/marks.js");
+  return arrowScale(lengths, wanted);
+}"""
+
+
+@pytest.mark.browser
+@in_browser
+def test_a_wrong_match_neither_scales_nor_covers_the_other_arrows(
+    browser: Any, server: Server
+) -> None:
+    with opened(browser, server.login, NARROW) as page:
+        alone = page.evaluate(SCALE_JS, [[0.05] * 9, 25])
+        both = page.evaluate(SCALE_JS, [[0.05] * 9 + [300], 25])
+        assert alone["factor"] == both["factor"] == 500
+        assert both["longest"] == pytest.approx(0.4)
+        assert alone["text"] == "arrows × 500, median 0.0500 px of 9"
+        assert both["text"].endswith("of 10; 1 shortened, up to 300 px")
+        assert page.evaluate(SCALE_JS, [[0.013], 25])["factor"] == 2000
+        assert page.evaluate(SCALE_JS, [[], 25])["text"] == ""
 
 
 @pytest.mark.browser
@@ -132,7 +135,7 @@ def test_arrows_are_drawn_over_the_frame_and_over_the_dome(
         assert come(lambda: rows.count() > 10)
         means = [float(row.locator("td").nth(2).inner_text()) for row in rows.all()]
         assert means == sorted(means, reverse=True)
-        page.get_by_role("checkbox", name="residuals in 3-D").click()
+        page.get_by_label("residuals in 3-D").click()
         dome = page.locator(".lab-space canvas").first
         assert come(lambda: dome.get_attribute("data-arrows") == str(len(means)))
         page.get_by_text(re.compile("^arrows × ")).wait_for()

@@ -132,15 +132,19 @@ class PhotoPanel:
         self.button.set_text("Stop")
         is_folder = Path(source).is_dir()
         while self.live:
-            if self.real.compares.value:
-                photo = await self.page.ask("compare_next", source, self.real.follows.value)
-            else:
-                photo = await self.page.ask("solve_next", source, self.fov.value, self.stages)
+            as_scene = self.real.compares.value
+            photo = await self.page.ask(
+                "solve_next",
+                source,
+                self.fov.value,
+                self.stages,
+                as_scene,
+                self.real.follows.value,
+            )
             if not self.page.is_open:
                 return
-            if isinstance(photo, Photo) and self.real.compares.value:
+            if photo and as_scene:
                 self.real.show(photo)
-                # The chosen picture of it.
                 await self.real.choose()
             elif photo:
                 self.show(photo.name, photo)

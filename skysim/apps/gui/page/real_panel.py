@@ -1,7 +1,5 @@
 """Real camera over the simulation: its newest frame, the rendered one, both in turn, their difference and overlay."""
 
-import math
-
 from nicegui import ui
 
 from skysim.apps.gui.messages import REAL_VIEWS
@@ -37,7 +35,7 @@ class RealPanel:
                 [*REAL_VIEWS, BLINK], value=self.shown, on_change=self.choose
             )
             self.views.props("dense no-caps unelevated size=sm").mark("real-views")
-            self.text = ui.label().classes("mono").mark("real")
+            self.text = ui.label().style("white-space: pre-line").mark("real")
             widgets.button("Explain the residuals", self.explain, "explain")
             self.answer = ui.label().mark("explanation")
         self.results.set_visibility(False)
@@ -48,17 +46,11 @@ class RealPanel:
         self.shown = REAL_VIEWS[0]
         self.page.show_photo(photo, kind="photo", photo=photo.name)
         row = photo.result.row
-        heads = "".join(f"{name:>11s}" for name in photo.names)
-        lines = [f"{photo.name}: {row.status}", f"{'':10s}{heads}"]
-        for name, angles in (("real", row.estimate_deg), ("simulated", photo.angles_deg)):
-            values = "".join(f"{angle:11.4f}" for angle in angles or ())
-            lines.append(f"{name:10s}{values}")
-        if not math.isnan(row.cross_arcsec):
-            lines += [
-                f"difference: cross {row.cross_arcsec:.1f}″  roll {row.roll_arcsec:+.1f}″",
-                f"{row.matched} of {row.detected} lights identified, residuals {row.rms_px:.3f} px rms",
-            ]
-        self.text.set_text("\n".join(lines))
+        self.text.set_text(
+            f"{photo.name}: {row.status}, {row.matched} of {row.detected} lights identified, residuals"
+            f" {row.rms_px:.3f} px rms\nreal minus simulated: cross {row.cross_arcsec:.1f}″,"
+            f" roll {row.roll_arcsec:+.1f}″"
+        )
         self.results.set_visibility(True)
 
     async def choose(self) -> None:

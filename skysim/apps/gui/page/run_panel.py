@@ -13,9 +13,9 @@ from typing import Any
 from nicegui import ui
 
 from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, Residual, SceneInfo
-from skysim.apps.gui.page.residuals import FlightLights
+from skysim.apps.gui.page.residuals import FlightLights, by_light
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
-from skysim.apps.gui.views import context, forms, space, widgets
+from skysim.apps.gui.views import context, forms, widgets
 from skysim.results import scoring
 from skysim.scene.scene import Scene
 
@@ -71,9 +71,8 @@ class RunPanel:
     begun_s = -math.inf
     drawn_s = 0.0
 
-    def __init__(self, page: context.PageContext, scene_3d: space.Scene3D) -> None:
+    def __init__(self, page: context.PageContext) -> None:
         self.page = page
-        self.scene_3d = scene_3d
         self.when_shown: Callable[[], None] | None = None
         self.factor = SPEEDS["real time"]
         self.slot = ui.context.slot
@@ -113,7 +112,7 @@ class RunPanel:
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
         self.strips = StripChart(self.page.contents)
-        self.by_light = FlightLights(self.page, self.scene_3d)
+        self.lights = FlightLights().mark("residuals")
         self.clear()
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
@@ -163,7 +162,7 @@ class RunPanel:
         self.seek.set_value(0)
         self.bar.set_value(0)
         self.strips.draw([], 1.0, str)
-        self.by_light.show(())
+        self.lights.run_method("show", [])
         self.enable()
 
     async def close_loop(self) -> None:
@@ -257,7 +256,9 @@ class RunPanel:
         self.strips.draw(
             strips(self.rows, self.log, lights), max(ends, default=1.0), self.page.sensor.name
         )
-        self.by_light.show(lights)
+        info = self.page.scene_info
+        assert info is not None
+        self.lights.run_method("show", *by_light(lights), info.prefix, info.pixel_arcsec)
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
 

@@ -10,7 +10,7 @@ from nicegui import ui
 
 from skysim.apps.gui.messages import Curves, FlightRow, LightName, Residual
 from skysim.apps.gui.views.style import CURVE_COLORS, RULE, TOOLTIP, chart_color
-from skysim.apps.gui.views.widgets import Contents, round_up
+from skysim.apps.gui.views.widgets import Contents
 from skysim.core.types import Record, frozen
 
 BAND_COLOR = "#8b95a5"
@@ -276,7 +276,10 @@ def options(drawn: list[Strip], end_s: float) -> Record:
 def y_axis(strip: Strip, n: int) -> Record:
     axis = {"gridIndex": n, "splitNumber": 3, "type": "log" if strip.logarithmic else "value"}
     if strip.dots:
-        end = round_up(max(1e-6, *(dot[1] for dot in strip.dots)))
+        # The next greater of 1, 2, 5, 10 times a power of ten.
+        most = max(dot[1] for dot in strip.dots)
+        decade = 10.0 ** math.floor(math.log10(max(most, 1e-6)))
+        end = next(step * decade for step in (1, 2, 5, 10) if step * decade >= most)
         return axis | {"min": 0, "max": float(f"{end:.6g}")}
     if strip.logarithmic:
         # Whole decades that contain the values, at most the uppermost four.

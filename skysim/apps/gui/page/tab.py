@@ -167,7 +167,7 @@ class Tab(context.PageContext):
                     scene_panel = settings_panel.ScenePanel(self, self.head.update_scenes)
                 await asyncio.sleep(PAUSE_S)
                 with ui.tab_panel("Run").classes("lab-run"):
-                    self.run_panel = run_panel.RunPanel(self, self.scene_3d)
+                    self.run_panel = run_panel.RunPanel(self)
                 with ui.tab_panel("Plan"):
                     self.plan_panel = plan_panel.PlanPanel(
                         self, self.scene_3d, self.run_panel

@@ -23,7 +23,6 @@ from skysim.apps.gui.messages import (
     TrackerResult,
     places_px,
 )
-from skysim.apps.gui.views import widgets
 from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
@@ -46,9 +45,6 @@ MAX_TRUTH_MARKS = 400  # maximum number of marks of true lights
 UNSOLVED_TICKS = 60  # number of brightest true lights with marks in a frame without detections; fainter ones are dots
 # Proper names of bright stars by Hipparcos number.
 NAMES: dict[Any, str] = read_yaml(DATA / "star_names.yaml")[0]
-ARROW_SHARE = 0.025  # least length of the median residual's arrow over the frame's width
-LONGEST = 8.0  # longest arrow over the median one
-LEAST_PX = 1e-6  # least median residual that is enlarged
 NEAR_PX = 4.0  # a detection within this distance of a true light is not false
 
 T = TypeVar("T")
@@ -69,6 +65,8 @@ def marks(
         (x, y, name) of identified lights
     lights
         (x, y, number or -1, whether it is a detection) of all lights that the cursor may find, detections last
+    residuals
+        (x, y, along x, along y) of identified lights: detected minus predicted
     """
     detections = result.detections if result else ()
     ids = [one.id for one in detections]
@@ -104,50 +102,12 @@ def marks(
         ],
         "names": [(*place, name(id)) for place, id in named] if "identified" in shown else [],
         "lights": true_lights + detected_lights,
+        "residuals": [
+            (one.x, one.y, *one.residual_px)
+            for one in detections
+            if one.id >= 0 and "residuals" in shown
+        ],
     }
-
-
-def arrows(result: TrackerResult | None, shown: Collection[str], width_px: int) -> Record:
-    """The residuals of the identified lights as arrows for frame.js, and their scale in words.
-
-    The median is as long as a fixed share of the frame, so that a few wrong matches do not make the others invisible.
-
-    Returns
-    -------
-    arrows
-        (x, y, along x, along y, whether it is shortened) on the enlarged scale
-    arrows_text
-        Scale and median; "" without arrows
-    """
-    found = [one for one in result.detections if one.id >= 0] if result else []
-    if "residuals" not in shown or not found:
-        return {"arrows": [], "arrows_text": ""}
-    vectors_px = np.array([one.residual_px for one in found])
-    lengths_px = np.hypot(*vectors_px.T)
-    factor, longest_px, text = arrow_scale(lengths_px, ARROW_SHARE * width_px)
-    shorter = longest_px / np.maximum(lengths_px, longest_px)
-    drawn_px = factor * shorter[:, None] * vectors_px
-    rows = zip(rounded(places_px(found)), rounded(drawn_px), shorter < 1, strict=True)
-    return {
-        "arrows": [[*place, *along, bool(cut)] for place, along, cut in rows],
-        "arrows_text": text,
-    }
-
-
-def arrow_scale(lengths_px: Floats, wanted_px: float) -> tuple[float, float, str]:
-    """Factor by which arrows are enlarged so that their median is about `wanted_px`, the greatest length that is drawn
-    in full (before enlarging), and both in words.
-    """
-    median_px = float(np.median(lengths_px))
-    factor = widgets.round_up(wanted_px / max(median_px, LEAST_PX))
-    longest_px = LONGEST * max(median_px, LEAST_PX)
-    cut = int(np.sum(lengths_px > longest_px))
-    shortened = f"; {cut} shortened, up to {np.max(lengths_px):.3g} px" if cut else ""
-    return (
-        factor,
-        longest_px,
-        f"arrows × {factor:g}, median {median_px:.3g} px of {len(lengths_px)}{shortened}",
-    )
 
 
 def bright_count(lights: Lights, identified: Collection[int], near: Bools) -> int:

@@ -210,8 +210,7 @@ class SensorView:
     def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
         view = {"pose": self.pose, "label": self.description()}
-        marks = overlay.marks(self.lights, self.result, self.shown, self.name)
-        return view | marks | overlay.arrows(self.result, self.shown, self.size_px[0])
+        return view | overlay.marks(self.lights, self.result, self.shown, self.name)
 
     def description(self) -> str:
         """Text alternative of the view for screen readers."""

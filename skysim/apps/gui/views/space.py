@@ -75,10 +75,6 @@ class Scene3D:
         )
         self.canvas.run_method("color", list(zip(ids, colors, strict=True)))
 
-    def draw_arrows(self, ids: Ints, places_m: Floats) -> None:
-        """Draw an arrow at each of some lights, (N, 3) along lab axes; none erase the former ones."""
-        self.canvas.run_method("arrows", list(zip(ids, places_m, strict=True)))
-
     def show(self, view: FrameView) -> None:
         """Send the attitude after a delay, so that of many frames in a short time only the last one is sent."""
         self.newest_view = view

@@ -8,7 +8,6 @@ it draws the frame. Without a new frame they are sent in a message.
 import asyncio
 import csv
 import io
-import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -176,12 +175,6 @@ def for_page(error: InputError) -> str:
 def format_number(value: float) -> str:
     """Format with three significant digits; from 100 up, as an integer."""
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
-
-
-def round_up(value: float) -> float:
-    """The least of 1, 2, 5 times a power of ten that is not below a positive value."""
-    decade = 10.0 ** math.floor(math.log10(value))
-    return next(step * decade for step in (1, 2, 5, 10) if step * decade >= value)
 
 
 def csv_table(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> bytes:

@@ -68,6 +68,8 @@ class Photo:
         Likely cause of a refusal, or assumption about a solved file
     name
         Name of the file, or of the camera
+    compared
+        Whether `angles_deg` are those of the simulation, which is compared with a real camera
     """
 
     result: TrackerResult
@@ -83,6 +85,7 @@ class Photo:
     prefix: str = "HIP"
     hint: str = ""
     name: str = "camera"
+    compared: bool = False
 
 
 UNKNOWN = (math.nan,) * 3

@@ -20,7 +20,12 @@ from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.images import ViewedImage
 from skysim.core.types import Floats, Frame
-from skysim.experiments.dome_survey import adjust, survey_frames, survey_procedure
+from skysim.experiments.dome_survey import (
+    adjust,
+    survey_frames,
+    survey_procedure,
+    survey_report,
+)
 from skysim.experiments.dome_survey.survey_findings import SurveyRun
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, SurveyFrame
 from skysim.results import plots, scoring
@@ -29,6 +34,7 @@ from skysim.scene.scene import Scene
 from skysim.simulation.lab import build_lab
 from skysim.tracking import factory, onboard_model
 
+NO_FRAME = "no real frame is solved yet: watch a folder, a video or a camera"
 CLEAR_SIGMAS = 3.0  # change over its standard error from which it is no chance
 LIGHT_SIGMAS = 5.0  # scatter of the sky above which a pixel counts as light
 
@@ -110,9 +116,7 @@ class Comparison:
         view = bench.render_at_rest()
         assert bench.frame is not None
         assert bench.truth is not None
-        top_dn = np.iinfo(pixels.dtype).max if pixels.dtype.kind == "u" else np.inf
-        saturation_dn = min(float(top_dn), view.saturation_dn)
-        frame = Frame(len(self.taken), pixels, 0.0, view.exposure_s, saturation_dn)
+        frame = replace(bench.frame, image_dn=pixels)
         result = workbench.tracker_result(bench.lab, tracker, frame, bench.truth, report)
         # The simulated attitude is no truth of the real one.
         result = replace(result, row=replace(result.row, wrong=False))
@@ -120,7 +124,7 @@ class Comparison:
             result,
             {},
             view.statistics,
-            saturation_dn=saturation_dn,
+            saturation_dn=view.saturation_dn,
             lens=bench.lens,
             pose=view.pose if follow else None,
             names=scoring.angle_names(bench.scene),
@@ -128,6 +132,7 @@ class Comparison:
             lights=view.lights,
             prefix=workbench.id_prefix(bench.lab),
             name=name,
+            compared=True,
         )
         self.pictures = pictures(pixels, bench.frame.image_dn)
         return self.show(REAL_VIEWS[0])
@@ -146,7 +151,7 @@ class Comparison:
     def show(self, name: str) -> PhotoPixels:
         """The newest frame as one of REAL_VIEWS. Raises InputError if there is none."""
         if self.photo is None or name not in self.pictures:
-            raise InputError("", "no real frame yet: watch a folder, a video or a camera")
+            raise InputError("", NO_FRAME)
         image = self.pictures[name]
         statistics = plots.frame_statistics(image, self.photo.saturation_dn)
         return replace(self.photo, statistics=statistics), image
@@ -154,10 +159,10 @@ class Comparison:
     def explain(self) -> str:
         """What a survey by the frames so far finds of focal length, lever and LEDs. Raises InputError."""
         lab = build_lab(survey_frames.as_listed(self.scene))
-        prior = survey_frames.listed_prior(lab, onboard_model.assumed_camera(lab.scene))
+        camera = onboard_model.assumed_camera(lab.scene)
+        prior = survey_frames.listed_prior(lab, camera)._replace(uncertainty=UNCERTAINTY)
         if not self.taken:
-            raise InputError("survey", "no real frame is solved", "several attitudes")
-        prior = prior._replace(uncertainty=UNCERTAINTY)
+            raise InputError("", NO_FRAME)
         run = adjust.run_survey(self.taken, prior)
         return explanation(run, prior, float(rms(np.array(self.rms_px))))
 
@@ -186,27 +191,27 @@ def explanation(run: SurveyRun, prior: CalibrationPrior, before_px: float) -> st
     before_px
         Rms of the residuals by the model before it
     """
-    survey = run.survey
-    accuracy = run.accuracy
-    measured = accuracy.measured
-    focal_px = survey.camera.focal_px - prior.camera.focal_px
-    lever_m = survey.lever.camera_body_m - prior.lever.camera_body_m
-    moved_m = (survey.leds.position_m - run.listed.position_m)[measured]
-    leds_m = float(rms(moved_m.ravel()))
-    lever = ", ".join(f"{one:+.2f}" for one in 1e3 * lever_m)
-    sigma_px = accuracy.lens_sigma[0]
-    ratios = {
-        f"the focal length by {focal_px:+.2f} ± {sigma_px:.2g} px": abs(focal_px) / sigma_px,
-        f"the lever by ({lever}) ± {1e3 * rms(accuracy.lever_sigma_m):.2g} mm": float(
-            rms(lever_m / accuracy.lever_sigma_m)
-        ),
-        f"{measured.sum()} of {len(measured)} LEDs by {1e3 * leds_m:.2g} mm rms about each axis, each to"
-        f" ± {1e3 * accuracy.led_rms_m:.2g} mm": leds_m / accuracy.led_rms_m,
-    }
-    ordered = sorted(ratios, key=lambda text: -ratios[text])
-    changes = "; ".join(f"{text} ({ratios[text]:.1f} σ)" for text in ordered)
-    weak = "" if ratios[ordered[0]] > CLEAR_SIGMAS else " Nothing stands out: more frames."
+    found = survey_report.survey_statistics(run, prior)
+    measured = run.survey.surveyed
+    moved_m = (run.survey.leds.position_m - run.listed.position_m)[measured]
+    led_mm = 1e3 * float(rms(moved_m.ravel()))
+    sigma_mm = 1e3 * run.accuracy.led_rms_m
+    changes = [
+        (row["what"], row["found"] - row["believed"], row["sigma"])
+        for row in found["values"]
+        if row["sigma"]
+    ]
+    changes.append(
+        (f"places of {measured.sum()} LEDs, mm rms along an axis", led_mm, sigma_mm)
+    )
+    changes.sort(key=lambda one: -abs(one[1] / one[2]))
+    _, change, sigma = changes[0]
+    is_clear = abs(change) > CLEAR_SIGMAS * sigma
+    first = "" if is_clear else " Nothing explains the residuals yet: more frames."
+    listed = "; ".join(
+        f"{what} {change:+.2f} ± {sigma:.2g}" for what, change, sigma in changes
+    )
     return (
-        f"{len(run.frames)} of {len(run.taken)} frames are connected, with residuals of {before_px:.2g} px rms before"
-        f" and {survey.rms_px:.2g} px after. The survey changes {changes}.{weak}"
+        f"{len(run.frames)} of {len(run.taken)} frames are connected, residuals {before_px:.2g} px rms before and"
+        f" {found['rms_px']:.2g} px after. Found minus assumed, the most significant first: {listed}.{first}"
     )

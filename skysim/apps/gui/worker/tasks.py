@@ -27,7 +27,6 @@ from skysim.apps.gui.worker import (
     real,
 )
 from skysim.apps.gui.worker.workbench import Workbench, ambiguity
-from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.simulation import checks
@@ -256,36 +255,35 @@ class Worker:
         source: str,
         fov_deg: float | None,
         stages: photo.Stages = (),
+        as_scene: bool = False,
+        follow: bool = False,
     ) -> photo.Photo | bool:
-        """Solve the next frame of a source, which stays open, as one of the sky; False if there is none yet."""
-        found = self.next_picture(source)
+        """Solve the next frame of a source, which stays open; False if there is none yet.
+
+        Parameters
+        ----------
+        as_scene
+            Whether it is of the scene's camera, else of any camera under the sky
+        follow
+            Whether the scene takes its attitude
+        """
+        if self.source is None:
+            self.source = real.Source(source)
+        found = self.source.picture()
         if found is None:
             return False
+        if as_scene:
+            return self.show_photo(self.comparison.solve(self.workbench, *found, follow))
         name, picture = found
         solved, image = photo.solve_frame(picture.pixels, fov_deg, stages)
         return self.show_photo((replace(solved, name=name), image))
 
-    def compare_next(self, source: str, follow: bool) -> photo.Photo | bool:
-        """Solve the next frame of a source as one of the scene's camera; False if there is none yet."""
-        bench = self.workbench
-        if self.compared is None or self.compared.scene != bench.scene:
-            self.compared = real.Comparison(bench.scene)
-        found = self.next_picture(source)
-        return found is not None and self.show_photo(
-            self.compared.solve(bench, *found, follow)
-        )
-
-    def next_picture(self, source: str) -> tuple[str, images.ViewedImage] | None:
-        """Name and pixels of the next frame of a source; None if there is none yet."""
-        if self.source is None:
-            self.source = real.Source(source)
-        return self.source.picture()
-
     @property
     def comparison(self) -> real.Comparison:
-        """The real frames of the scene. Raises InputError if there are none."""
-        if self.compared is None or self.compared.scene != self.workbench.scene:
-            raise InputError("", "no real frame of this scene: watch its camera")
+        """The real frames of the scene."""
+        scene = self.workbench.scene
+        if self.compared is None or self.compared.scene != scene:
+            self.compared = real.Comparison(scene)
         return self.compared
 
     def real_view(self, name: str) -> photo.Photo:

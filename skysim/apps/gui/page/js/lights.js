@@ -8,8 +8,6 @@ export default {
           :data-id="row.id" @pointerenter="hover(row.id)"><td v-for="cell in row.cells">{{ cell }}</td></tr>
       </tbody>
     </table>`,
-  // still: whether a light that is hovered elsewhere does not scroll the panel, which has other views too
-  props: { still: Boolean },
   data: () => ({ heads: [], rows: [], ringed: null }),
   mounted() {
     window.addEventListener("skysim-hover", this.ring);
@@ -27,7 +25,7 @@ export default {
     },
     ring({ detail: { id } }) {
       this.ringed = id;
-      if (id !== null && !this.still) this.$el.querySelector(`tr[data-id="${id}"]:not(:hover)`)?.scrollIntoView({ block: "nearest" });
+      if (id !== null) this.$el.querySelector(`tr[data-id="${id}"]:not(:hover)`)?.scrollIntoView({ block: "nearest" });
     },
   },
 };

@@ -307,7 +307,7 @@ export default {
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
       if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
       drawMarks(pen, marks, this.toScreen);
-      drawArrows(pen, this.drawn, this.toScreen, window);
+      canvas.dataset.arrows = drawArrows(pen, this.drawn.residuals, size[0], this.toScreen, window);
       drawNames(pen, names, this.toScreen, window, NAME);
       if (this.cut) this.paintCut(pen);
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
@@ -315,7 +315,6 @@ export default {
       canvas.dataset.frame = this.drawn.src;
       canvas.dataset.whole = this.drawn.isWhole;
       canvas.dataset.placement = [left, top, scale].map((value) => value.toFixed(6)).join(" ");
-      canvas.dataset.arrows = this.drawn.arrows_text ?? "";
       canvas.dataset.ringed = ringed ? ringed[2] : "";
       canvas.ariaLabel = this.drawn.label;
       this.paintUnder();

@@ -48,9 +48,11 @@ export default {
     this.sight = new IntersectionObserver((entries) => this.see(entries.at(-1).isIntersecting));
     this.sight.observe(this.$el);
     window.addEventListener("skysim-hover", this.ring);
+    window.addEventListener("skysim-arrows", this.drawArrows);
   },
   beforeUnmount() {
     window.removeEventListener("skysim-hover", this.ring);
+    window.removeEventListener("skysim-arrows", this.drawArrows);
     this.watcher?.disconnect();
     this.sight?.disconnect();
     this.renderer?.dispose();
@@ -98,11 +100,11 @@ export default {
       this.draw();
     },
     // Arrows at some lights: [number, along x, y, z as an angle seen from the middle of the laboratory] each.
-    arrows(pairs) {
+    drawArrows({ detail: { arrows } }) {
       if (!this.vehicle) return;
       this.world.remove(this.arrowLines);
       const index = new Map(this.lab.lights.id.map((id, n) => [id, n])), ends = [];
-      for (const [id, along] of pairs) {
+      for (const [id, along] of arrows) {
         if (!index.has(id)) continue;
         const from = new THREE.Vector3().fromArray(this.lab.lights.place, 3 * index.get(id));
         ends.push(from, from.clone().addScaledVector(new THREE.Vector3(...along), from.length()));
