@@ -225,6 +225,11 @@ Curves = dict[
 ]  # curves of a simulated motion and their times `t_s`, decimated for display
 
 
+AtLimit = tuple[
+    str, float, float
+]  # what was at its limit in a flight, from a time to another
+
+
 class FlightRow(NamedTuple):
     """One frame of a flight in numbers; NaN if the scene has no filter.
 
@@ -234,6 +239,8 @@ class FlightRow(NamedTuple):
         As in `solutions.ecsv`
     lights
         Number of lights in the field
+    saturated
+        Number of saturated pixels
     filter_arcsec
         Error of the filter
     innovation_arcsec
@@ -242,6 +249,7 @@ class FlightRow(NamedTuple):
 
     row: FrameRow
     lights: int
+    saturated: int
     filter_arcsec: float
     innovation_arcsec: float
 
@@ -274,6 +282,8 @@ class FlightStep(NamedTuple):
         Curves of the motion so far, if there are new frames
     residuals
         Residuals of the lights identified in these frames
+    limits
+        What was at its limit so far
     """
 
     is_done: bool
@@ -282,6 +292,7 @@ class FlightStep(NamedTuple):
     rows: Sequence[FlightRow] = ()
     log: Curves | None = None
     residuals: Sequence[Residual] = ()
+    limits: Sequence[AtLimit] = ()
 
 
 class AmbiguityMap(NamedTuple):
