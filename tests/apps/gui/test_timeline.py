@@ -32,6 +32,8 @@ in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed"
 
 
 def test_limits_are_the_times_of_the_telemetry() -> None:
+    bearing = SimpleNamespace(mount="air_bearing", tilt_stop_deg=30.0)
+    free = SimpleNamespace(mount="free", tilt_stop_deg=30.0)
     wheel = np.array([0.2, 1.0, 1.0, 0.5, 1.0, 0.1])
     log = SimpleNamespace(
         t_s=0.1 * np.arange(6),
@@ -41,7 +43,9 @@ def test_limits_are_the_times_of_the_telemetry() -> None:
             np.radians([[x, 0, 0] for x in (0, 10, 20, 29.95, 30, 30)])
         ),
     )
-    found = [(name, round(a, 6), round(b, 6)) for name, a, b in playback.at_limits(log, 30.0)]
+    found = [
+        (name, round(a, 6), round(b, 6)) for name, a, b in playback.at_limits(log, bearing)
+    ]
     assert found == [
         ("wheel_x limit", 0.1, 0.2),
         ("wheel_x limit", 0.4, 0.4),
@@ -49,7 +53,7 @@ def test_limits_are_the_times_of_the_telemetry() -> None:
         ("tilt stop", 0.3, 0.5),
     ]
     log.saturated = None
-    assert len(list(playback.at_limits(log, 90.0))) == 2
+    assert len(list(playback.at_limits(log, free))) == 2
 
 
 def test_a_frame_s_row_counts_its_saturated_pixels() -> None:

@@ -61,6 +61,8 @@ class SensorView:
         Id of the tab, and contents of its live fields
     source
         Source of pixels, once the tab has a worker
+    well
+        Electrons per digital number, bias in digital numbers, and electrons of a full well, of a scene's detector
     hover_px
         Place of the light under the mouse, or None
     sent_number
@@ -75,6 +77,7 @@ class SensorView:
     prefix = "HIP"
     lens: Lens | None = None
     pose: Pose | None = None
+    well: tuple[float, float, float] | None = None
     statistics = ""  # numbers of the frame, shown while no light is under the mouse
     hover_px: tuple[float, float] | None = None
     sent_number = 0
@@ -186,6 +189,12 @@ class SensorView:
         self.result = image.result
         self.size_px = image.pixels.fields["size"]
         self.pose = image.pose
+        detector = of.scene.camera.detector if isinstance(of, SceneInfo) else None
+        self.well = detector and (
+            detector.gain_e_dn,
+            detector.offset_dn,
+            detector.full_well_e,
+        )
         is_new_lens = of.lens is not self.lens
         if is_new_lens:
             self.lens = of.lens
@@ -209,7 +218,7 @@ class SensorView:
 
     def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
-        view = {"pose": self.pose, "label": self.description()}
+        view = {"pose": self.pose, "label": self.description(), "well": self.well}
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
 
     def description(self) -> str:

@@ -122,10 +122,10 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-run > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
-.lab-timeline {{ width: 100% }} .lab-timeline .lane {{ position: relative; height: 20px;
+.lab-timeline {{ width: 100% }} .lab-timeline .lane {{ position: relative; height: 26px;
   border-bottom: 1px solid {COLORS["line"]} }}
-.lab-timeline span {{ position: absolute; right: 12px; font-size: 11px; line-height: 20px; pointer-events: none }}
-.lab-timeline button {{ position: absolute; top: 3px; height: 13px; min-width: 5px; padding: 0; border: 0;
+.lab-timeline span {{ position: absolute; left: 0; font-size: 11px; line-height: 14px; pointer-events: none }}
+.lab-timeline button {{ position: absolute; top: 15px; height: 9px; min-width: 5px; padding: 0; border: 0;
   transform: translateX(-2px); cursor: pointer }}
 .lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}

@@ -48,6 +48,7 @@ from skysim.results import telemetry_report
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import Lab
 from skysim.simulation.motion import at_limit
@@ -125,7 +126,7 @@ class Playback:
             log = self.flight.telemetry()
             rows = [frame_row(frame, log, mount) for frame in new]
             drawn = curves(log)
-            limits += at_limits(log, self.bench.scene.vehicle.tilt_stop_deg)
+            limits += at_limits(log, self.bench.scene.vehicle)
         residuals = [one for frame in new for one in light_residuals(frame.view, mount)]
         flight = self.flight
         return FlightStep(
@@ -202,12 +203,14 @@ def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
     return FlightRow(result.row, *counts, filter_arcsec, innovation_arcsec)
 
 
-def at_limits(log: Telemetry, stop_deg: float) -> Iterator[AtLimit]:
+def at_limits(log: Telemetry, vehicle: VehicleConfig) -> Iterator[AtLimit]:
     """The times at which actuators, gyros or the tilt were at their limits, by the flight's telemetry."""
     masks = {f"{name} limit": full for name, full in at_limit(log.loads).items()}
     if log.saturated is not None:
         masks["gyro limit"] = log.saturated
-    masks["tilt stop"] = multibody.tilt_deg(log.lab_from_body) > stop_deg - AT_STOP_DEG
+    if vehicle.mount == "air_bearing":
+        least_deg = vehicle.tilt_stop_deg - AT_STOP_DEG
+        masks["tilt stop"] = multibody.tilt_deg(log.lab_from_body) > least_deg
     for name, mask in masks.items():
         ends = np.flatnonzero(np.diff([False, *mask, False]))
         for first, end in ends.reshape(-1, 2):

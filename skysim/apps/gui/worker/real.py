@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import REAL_VIEWS
 from skysim.apps.gui.worker import workbench
-from skysim.apps.gui.worker.photo import Photo, PhotoPixels
+from skysim.apps.gui.worker.photo import Photo, PhotoPixels, scene_photo
 from skysim.apps.gui.worker.playback import UNCERTAINTY
 from skysim.apps.plate_solver import plate_solution
 from skysim.core import images
@@ -28,7 +28,7 @@ from skysim.experiments.dome_survey import (
 )
 from skysim.experiments.dome_survey.survey_findings import SurveyRun
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, SurveyFrame
-from skysim.results import plots, scoring
+from skysim.results import plots
 from skysim.results.metrics import rms
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import build_lab
@@ -113,27 +113,16 @@ class Comparison:
             self.rms_px.append(attitude.rms_px)
             if follow:
                 bench.lab_from_body = body_from_lab.inv()
-        view = bench.render_at_rest()
+        bench.render_at_rest()
         assert bench.frame is not None
         assert bench.truth is not None
         frame = replace(bench.frame, image_dn=pixels)
-        result = workbench.tracker_result(bench.lab, tracker, frame, bench.truth, report)
+        solved = replace(bench, estimator=tracker)
+        photo = scene_photo(bench, solved.frame_view(frame, bench.truth, report, 0.0))
         # The simulated attitude is no truth of the real one.
-        result = replace(result, row=replace(result.row, wrong=False))
-        self.photo = Photo(
-            result,
-            {},
-            view.statistics,
-            saturation_dn=view.saturation_dn,
-            lens=bench.lens,
-            pose=view.pose if follow else None,
-            names=scoring.angle_names(bench.scene),
-            angles_deg=view.angles_deg,
-            lights=view.lights,
-            prefix=workbench.id_prefix(bench.lab),
-            name=name,
-            compared=True,
-        )
+        result = replace(photo.result, row=replace(photo.result.row, wrong=False))
+        pose = photo.pose if follow else None
+        self.photo = replace(photo, result=result, pose=pose, name=name, compared=True)
         self.pictures = pictures(pixels, bench.frame.image_dn)
         return self.show(REAL_VIEWS[0])
 
