@@ -189,12 +189,10 @@ class SensorView:
         self.result = image.result
         self.size_px = image.pixels.fields["size"]
         self.pose = image.pose
-        detector = of.scene.camera.detector if isinstance(of, SceneInfo) else None
-        self.well = detector and (
-            detector.gain_e_dn,
-            detector.offset_dn,
-            detector.full_well_e,
-        )
+        self.well = None
+        if isinstance(of, SceneInfo):
+            detector = of.scene.camera.detector
+            self.well = detector.gain_e_dn, detector.offset_dn, detector.full_well_e
         is_new_lens = of.lens is not self.lens
         if is_new_lens:
             self.lens = of.lens
