@@ -18,6 +18,10 @@ NAN = float("nan")
 LIMITS = ("automatic", "zscale", "min to max", "manual")
 
 
+# Pictures of a real frame and the rendered one.
+REAL_VIEWS = ("real", "simulated", "difference", "overlay")
+
+
 class Display(NamedTuple):
     """How the browser draws frames.
 
@@ -78,14 +82,20 @@ NO_LIGHTS: Lights = np.recarray(0, LIGHT)
 
 @frozen
 class Detection:
-    """A detection: pixel, standard error, flux; id of the matched light (-1: none) and its residual in pixels."""
+    """A detection: pixel, standard error, flux; id of the matched light (-1: none).
+
+    Attributes
+    ----------
+    residual_px
+        Along x and y, detected minus predicted by the tracker's attitude; NaN without a matched light
+    """
 
     x: float
     y: float
     sigma_px: float
     flux: float
     id: int = -1
-    residual_px: float = NAN
+    residual_px: tuple[float, float] = (NAN, NAN)
 
 
 def places_px(detections: Collection[Detection]) -> Floats:
@@ -215,6 +225,11 @@ Curves = dict[
 ]  # curves of a simulated motion and their times `t_s`, decimated for display
 
 
+AtLimit = tuple[
+    str, float, float
+]  # what was at its limit in a flight, from a time to another
+
+
 class FlightRow(NamedTuple):
     """One frame of a flight in numbers; NaN if the scene has no filter.
 
@@ -224,6 +239,8 @@ class FlightRow(NamedTuple):
         As in `solutions.ecsv`
     lights
         Number of lights in the field
+    saturated
+        Number of saturated pixels
     filter_arcsec
         Error of the filter
     innovation_arcsec
@@ -232,13 +249,24 @@ class FlightRow(NamedTuple):
 
     row: FrameRow
     lights: int
+    saturated: int
     filter_arcsec: float
     innovation_arcsec: float
 
 
-Residual = tuple[
-    float, int, float
-]  # of an identified light: time, its number, residual in pixels
+class Residual(NamedTuple):
+    """Residual of an identified light in a frame: time, number of the light, absolute value in pixels.
+
+    Attributes
+    ----------
+    lab_px
+        The residual along the axes of the lab frame, in which a wrong place of a light is constant
+    """
+
+    t_s: float
+    id: int
+    px: float
+    lab_px: Triple
 
 
 class FlightStep(NamedTuple):
@@ -254,6 +282,8 @@ class FlightStep(NamedTuple):
         Curves of the motion so far, if there are new frames
     residuals
         Residuals of the lights identified in these frames
+    limits
+        What was at its limit so far
     """
 
     is_done: bool
@@ -262,6 +292,7 @@ class FlightStep(NamedTuple):
     rows: Sequence[FlightRow] = ()
     log: Curves | None = None
     residuals: Sequence[Residual] = ()
+    limits: Sequence[AtLimit] = ()
 
 
 class AmbiguityMap(NamedTuple):

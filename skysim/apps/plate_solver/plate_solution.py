@@ -37,6 +37,7 @@ from skysim.core.types import Floats, Record, frozen
 
 if TYPE_CHECKING:
     from estimator.trackers.dome_tracker import DomeTracker
+    from skysim.scene.scene import Scene
 
 NOTED_STRETCH = 0.002  # relative to square pixels
 PIXEL_KEYS = ("x_px", "y_px", "residual_x_px", "residual_y_px")
@@ -444,16 +445,27 @@ def make_dome_solver(
     stages
         Names of algorithms by stage; the scene's for the others
     """
-    from skysim.experiments.dome_survey import survey_frames, survey_procedure
     from skysim.scene import loader
+
+    return dome_solver(loader.load_scene(dome), map_file, stages)
+
+
+def dome_solver(
+    scene: Scene,
+    map_file: str | Path | None = None,
+    stages: Mapping[str, str] | None = None,
+) -> DomeSolver:
+    """`make_dome_solver` of a loaded scene."""
+    from skysim.experiments.dome_survey import survey_frames, survey_procedure
     from skysim.simulation.lab import build_lab
     from skysim.tracking import factory, onboard_model
     from skysim.tracking.tracker_interface import OWN
 
-    scene = loader.load_scene(dome)
     light = scene.dome
     if light is None:
-        raise InputError("solve.dome", f"the light of {dome} is {scene.light.kind}", "a dome")
+        raise InputError(
+            "solve.dome", f"the light of {scene.name} is {scene.light.kind}", "a dome"
+        )
     # 1. The lists without simulated errors. One picture is too few for codes.
     own = scene.with_values("tracker", name=OWN, decoder=None, **(stages or {}))
     lab = build_lab(survey_frames.as_listed(own))

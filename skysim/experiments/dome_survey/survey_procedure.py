@@ -227,19 +227,42 @@ class News(NamedTuple):
     complaints: list[InputError]
 
 
+class CompleteFiles:
+    """Files that are written while they are watched: one is complete when a look finds it as the look before did.
+
+    Attributes
+    ----------
+    seen
+        Stamp of each file, and whether it was returned
+    """
+
+    def __init__(self) -> None:
+        self.seen: dict[Path, tuple[Stamp, bool]] = {}
+
+    def new(self, paths: Sequence[Path]) -> list[Path]:
+        """Those that are complete now, and have not been returned as they are."""
+        found = []
+        for path in paths:
+            stamp = stamp_of(path)
+            before, was_read = self.seen.get(path, (None, False))
+            if stamp is None or (stamp == before and was_read):
+                continue
+            self.seen[path] = (stamp, stamp == before)
+            if stamp == before:
+                found.append(path)
+        return found
+
+
 @dataclass
 class WatchedFolder:
-    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name.
-
-    A file is read when a look finds it as the look before did. `_seen` has its stamp, and whether it was read.
-    """
+    """The images of a folder so far; `pictures` has their names, detections and attitudes, ordered by name."""
 
     folder: Path
     camera: Camera
     settings: Settings
     _lights: dict[str, Centroids] = field(default_factory=dict)
     _attitudes: dict[str, Rotation] = field(default_factory=dict)
-    _seen: dict[str, tuple[Stamp, bool]] = field(default_factory=dict)
+    _files: CompleteFiles = field(default_factory=CompleteFiles)
 
     @property
     def pictures(self) -> list[SurveyImage]:
@@ -267,14 +290,7 @@ class WatchedFolder:
         self._lights = {
             name: lights for name, lights in self._lights.items() if name in names
         }
-        for path in [*paths, self.folder / ATTITUDES]:
-            stamp = stamp_of(path)
-            before, was_read = self._seen.get(path.name, (None, False))
-            if stamp is None or (stamp == before and was_read):
-                continue
-            self._seen[path.name] = (stamp, stamp == before)
-            if stamp != before:
-                continue
+        for path in self._files.new([*paths, self.folder / ATTITUDES]):
             try:
                 if path.name == ATTITUDES:
                     self._attitudes = read_attitudes(path)

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from tests.helpers.labpage import (
     CHROMIUM,
@@ -28,9 +29,10 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import LIGHT, Detection
+from skysim.apps.gui.messages import LIGHT, Detection, Residual
 from skysim.apps.gui.page import readouts, strips
 from skysim.apps.gui.worker import geometry, playback
+from skysim.core.types import Mount
 from skysim.scene import loader
 from skysim.simulation.lab import build_lab
 from tests.helpers.solutions import solution
@@ -52,8 +54,8 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
     )
     found = [
         Detection(200, 200, 0.1, 50),
-        Detection(10.3, 20.4, 0.05, 700, 3, 0.02),
-        Detection(40.0, 50.0, 0.1, 90, 9, 0.5),
+        Detection(10.3, 20.4, 0.05, 700, 3, (0.02, 0.0)),
+        Detection(40.0, 50.0, 0.1, 90, 9, (0.3, 0.4)),
     ]
     table = list(readouts.rows(true, found, "LED {}".format))
     assert [row["id"] for row in table] == [3, 4, 5, -1]
@@ -87,13 +89,19 @@ def test_an_led_without_current_is_dark_and_the_views_have_their_directions() ->
 
 def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() -> None:
     spots = (
-        Detection(1, 2, 0.1, 5, 7, 0.03125),
+        Detection(1, 2, 0.1, 5, 7, (0.0, 0.03125)),
         Detection(3, 4, 0.1, 5),
-        Detection(5, 6, 0.1, 5, 9, float("nan")),
+        Detection(5, 6, 0.1, 5, 9, (float("nan"), 0.0)),
     )
-    view = SimpleNamespace(result=solution(spots, t_s=0.25))
-    assert list(playback.light_residuals(view)) == [(0.25, 7, 0.03125)]
-    residuals = [(0.25, 7, 0.03125), (0.5, 7, 0.0625), (0.5, 9, 0.131)]
+    view = SimpleNamespace(
+        result=solution(spots, t_s=0.25), body_wxyz=np.array([1.0, 0, 0, 0])
+    )
+    mount = Mount(np.zeros(3), Rotation.identity())
+    assert list(playback.light_residuals(view, mount)) == [
+        (0.25, 7, 0.03125, (0.0, 0.03125, 0.0))
+    ]
+    values = (0.25, 7, 0.03125), (0.5, 7, 0.0625), (0.5, 9, 0.131)
+    residuals = [Residual(*one, (0.0, 0.0, 0.0)) for one in values]
     (strip,) = strips.strips([], {}, residuals)
     assert strip.dots == [[0.25, 0.0312, 7], [0.5, 0.0625, 7], [0.5, 0.131, 9]]
     assert strips.y_axis(strip, 0)["max"] == 0.2
@@ -105,7 +113,9 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
 
 
 def test_too_many_residuals_are_thinned_by_whole_frames() -> None:
-    residuals = [(t / 10, id, 0.1) for t in range(700) for id in range(60)]
+    residuals = [
+        Residual(t / 10, id, 0.1, (0.1, 0.0, 0.0)) for t in range(700) for id in range(60)
+    ]
     dots = strips.thinned(residuals)
     assert len(dots) <= strips.MAX_DOTS
     assert [[dot[2] for dot in dots if dot[0] == t] for t in (0.0, 0.3)] == [

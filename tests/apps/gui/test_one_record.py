@@ -71,7 +71,7 @@ def test_a_wrong_attitude_is_counted_in_the_flight_s_line() -> None:
     fine = solution((), cross_arcsec=3.0, roll_arcsec=4.0).row
     wrong = solution((), cross_arcsec=9000.0, roll_arcsec=0.0, wrong=True).row
     refused = solution((), "too few").row
-    rows = [FlightRow(row, 5, np.nan, np.nan) for row in (fine, wrong, refused)]
+    rows = [FlightRow(row, 5, 0, np.nan, np.nan) for row in (fine, wrong, refused)]
     assert rms_line(rows).startswith("2 of 3 frames solved, 1 wrong;")
 
 

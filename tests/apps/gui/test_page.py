@@ -193,7 +193,7 @@ def test_hovering_shows_a_star_s_data_and_a_click_enlarges_it(
     page.locator(".lab-under .mono", has_text="residual").wait_for()
     readout = page.locator(".lab-under .mono").inner_text()
     assert float(re.search(r"residual ([\d.]+) px", readout)[1]) == pytest.approx(
-        spot["residual_px"], abs=6e-4
+        np.hypot(*spot["residual_px"]), abs=6e-4
     )
     assert re.search(rf"centroid +{spot['x']:.2f} +{spot['y']:.2f} ", readout)
     assert float(re.search(r"V (-?[\d.]+)", readout)[1]) < 5

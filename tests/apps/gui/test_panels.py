@@ -329,7 +329,7 @@ LIGHTS = np.rec.fromarrays(
     ],
     LIGHT,
 )
-SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, 0.1), Detection(80.0, 80.0, 0.1, 1.0))
+SPOTS = (Detection(10.1, 20.0, 0.01, 5.0, 1, (0.1, 0.0)), Detection(80.0, 80.0, 0.1, 1.0))
 
 
 def test_each_kind_of_mark_has_its_position_and_can_be_switched_off() -> None:
@@ -783,7 +783,7 @@ def test_a_session_answers_refuses_bad_input_and_ends_with_its_tab() -> None:
             with pytest.raises(InputError, match=r"x\.exe: allowed"):
                 await session.run("solve_file", "x.exe", b"MZ", None)
             with pytest.raises(InputError, match="no camera found"):
-                await session.run("solve_camera", "nowhere.avi", None)
+                await session.run("solve_next", "nowhere.avi", None)
         finally:
             session.close()
         assert not session.process.is_alive()

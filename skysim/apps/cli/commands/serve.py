@@ -336,7 +336,7 @@ def gui(
     out
         Folder of studies and their reports.
     camera : SOURCE
-        Live camera that the page may watch: index, file or address; repeatable.
+        Camera that the page may watch: index, folder of images, video file or address; repeatable.
     workers
         Most worker processes, one for each page; further pages wait.
     show

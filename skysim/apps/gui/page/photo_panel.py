@@ -1,15 +1,19 @@
 """Image panel: solves an uploaded image or frames of a live camera; shows the solution or the reason for a refusal."""
 
+import asyncio
 import weakref
 from collections.abc import Callable, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from nicegui import ui
 
+from skysim.apps.gui.page import real_panel
 from skysim.apps.gui.views import context, widgets
 from skysim.apps.gui.worker.photo import SUFFIXES, Photo, Stages
 
+POLL_S = 0.5  # time between two looks at a folder
 LIMIT_BYTES = 64 * 2**20
 NO_IMAGE = (
     "No image on the page. Images are solved lost in space; uncertain matches are rejected."
@@ -61,7 +65,7 @@ class PhotoPanel:
         with widgets.row():
             self.source = widgets.select(
                 list(cameras), label="live camera", value=next(iter(cameras), None)
-            ).classes("flex-grow")
+            ).classes("flex-grow min-w-0")
             self.button = widgets.button("Watch", self.watch, "camera")
             if not cameras:
                 self.source.set_visibility(False)
@@ -69,6 +73,8 @@ class PhotoPanel:
                 widgets.quiet(
                     "No live camera is offered here. Cameras are named when the lab is started."
                 )
+        self.real = real_panel.RealPanel(page)
+        self.real.compares.set_visibility(bool(cameras))
         self.result_text = ui.label(NO_IMAGE)
         self.result_text.classes("mono quiet").style(
             "margin-top: 10px; white-space: pre-wrap"
@@ -111,7 +117,10 @@ class PhotoPanel:
             self.button.disable()
 
     async def watch(self) -> None:
-        """Solve frames of a live camera until the button is pressed again or a frame fails."""
+        """Solve frames of a live camera until the button is pressed again or a frame fails.
+
+        A folder is watched on after a failure, and while it has no further frame.
+        """
         if self.live:
             self.stop()
             return
@@ -124,18 +133,30 @@ class PhotoPanel:
         solved_count = 0
         source = str(self.source.value)
         self.button.set_text("Stop")
+        is_folder = Path(source).is_dir()
         while self.live:
-            photo = await self.page.run_task(
-                "solve_camera", source, self.fov.value, self.stages
+            as_scene = self.real.compares.value
+            photo = await self.page.ask(
+                "solve_next",
+                source,
+                self.fov.value,
+                self.stages,
+                as_scene,
+                self.real.follows.value,
             )
             if not self.page.is_open:
                 return
-            if (
-                photo or not solved_count
-            ):  # a camera that ends keeps its last result on the page
-                self.show("camera", photo)
+            if photo and as_scene:
+                self.real.show(photo)
+                await self.real.choose()
+            elif photo:
+                self.show(photo.name, photo)
+            elif is_folder:
+                await asyncio.sleep(POLL_S)
+            elif not solved_count:  # a camera that ends keeps its last result on the page
+                self.show("camera", None)
             solved_count += 1
-            self.live = self.live and photo is not None
+            self.live = self.live and (is_folder or photo is not None)
         self.button.disable()
         await self.page.ask("release")
         self.button.set_text("Watch")

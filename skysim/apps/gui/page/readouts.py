@@ -26,6 +26,8 @@ from skysim.apps.gui.views.widgets import LiveInput, LiveText, format_number
 from skysim.apps.gui.worker.photo import Photo
 from skysim.core.types import Record
 
+KINDS = "true (F5)", "tracker"
+COMPARED = "simulated", "real"  # of a real camera's frame
 ANGLES_JS = (
     "() => emit([...document.querySelectorAll('.lab-angle')].map(field => field.value))"
 )
@@ -40,9 +42,9 @@ class AttitudeCard:
             with widgets.div("lab-grid"):
                 widgets.quiet("attitude")
                 self.heads = [ui.label().classes("quiet num") for _ in range(3)]
-                widgets.quiet("true (F5)")
+                self.kinds = [widgets.quiet(KINDS[0])]
                 self.inputs = [self.angle_input(n) for n in range(3)]
-                widgets.quiet("tracker")
+                self.kinds.append(widgets.quiet(KINDS[1]))
                 self.estimates = [
                     LiveText(page.contents, "–").classes("mono num") for _ in range(3)
                 ]
@@ -94,6 +96,9 @@ class AttitudeCard:
         """Display the attitudes of a frame of a scene or of another image; a user's image has no true attitude."""
         for head, name in zip(self.heads, of.names, strict=True):
             head.set_text(f"{name}, deg")
+        compared = isinstance(image, Photo) and image.compared
+        for label, text in zip(self.kinds, COMPARED if compared else KINDS, strict=True):
+            label.set_text(text)
         known = image.angles_deg
         placeholder = "" if known else "unknown"
         for n, field in enumerate(self.inputs):

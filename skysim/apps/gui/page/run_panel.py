@@ -12,7 +12,15 @@ from typing import Any
 
 from nicegui import ui
 
-from skysim.apps.gui.messages import Curves, FlightRow, FlightStep, Residual, SceneInfo
+from skysim.apps.gui.messages import (
+    AtLimit,
+    Curves,
+    FlightRow,
+    FlightStep,
+    Residual,
+    SceneInfo,
+)
+from skysim.apps.gui.page.residuals import FlightLights, by_light
 from skysim.apps.gui.page.strips import StripChart, rms_line, strips
 from skysim.apps.gui.views import context, forms, widgets
 from skysim.results import scoring
@@ -28,6 +36,10 @@ DOUBLE_CLICK_S = (
     0.5  # the second click of a double click does not stop what the first has begun
 )
 DRAW_S = 0.7  # interval of drawing the strips while frames are computed
+
+
+class Timeline(ui.element, component="js/timeline.js"):  # type: ignore[call-arg]
+    """What happened in a flight, implemented in timeline.js; a click shows the frame."""
 
 
 class RunPanel:
@@ -110,7 +122,9 @@ class RunPanel:
         with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
+        self.timeline = Timeline().on("moment", self.clicked).mark("timeline")
         self.strips = StripChart(self.page.contents)
+        self.lights = FlightLights().mark("residuals")
         self.clear()
         self.page.derive(lambda view: view.opened, self.clear)
         self.page.derive(lambda view: view.kind == "flight", self.hide_moment)
@@ -155,11 +169,14 @@ class RunPanel:
         self.rows: list[FlightRow] = []
         self.log: Curves = {}
         self.residuals: list[Residual] = []
+        self.limits: Sequence[AtLimit] = ()
         self.index = 0
         self.from_s = 0.0
         self.seek.set_value(0)
         self.bar.set_value(0)
         self.strips.draw([], 1.0, str)
+        self.lights.run_method("show", [])
+        self.timeline.run_method("show", [], [], 1.0)
         self.enable()
 
     def hide_moment(self) -> None:
@@ -241,6 +258,7 @@ class RunPanel:
         self.rows += step.rows
         self.residuals += step.residuals
         self.log = step.log or self.log
+        self.limits = step.limits or self.limits
         self.bar.set_value(step.t_s / max(step.duration_s, 1e-9))
         self.summary.set_text(
             f"{step.t_s:.2f} of {step.duration_s:.2f} s, {len(self.rows)} frames"
@@ -258,6 +276,13 @@ class RunPanel:
         self.strips.draw(
             strips(self.rows, self.log, lights), max(ends, default=1.0), self.page.sensor.name
         )
+        frames = [
+            (one.row.t_s, one.row.status, one.row.wrong, one.saturated) for one in self.rows
+        ]
+        self.timeline.run_method("show", frames, self.limits, max(ends, default=1.0))
+        info = self.page.scene_info
+        assert info is not None
+        self.lights.run_method("show", *by_light(lights), info.prefix, info.pixel_arcsec)
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
 

@@ -169,10 +169,10 @@ def point(t_s: float, value: float) -> list[float]:
 
 def thinned(residuals: Sequence[Residual]) -> Points:
     """The residuals as dots: of all frames or, if they are more than MAX_DOTS, of frames at equal steps."""
-    times_s = sorted({t_s for t_s, _, _ in residuals})
+    times_s = sorted({one.t_s for one in residuals})
     kept = set(times_s[:: max(math.ceil(len(residuals) / MAX_DOTS), 1)])
     return [
-        [round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px in residuals if t_s in kept
+        [round(t_s, 4), float(f"{px:.3g}"), id] for t_s, id, px, _ in residuals if t_s in kept
     ]
 
 

@@ -22,6 +22,7 @@ from skysim.apps.gui.page import (
     photo_panel,
     plan_panel,
     readouts,
+    real_panel,
     run_panel,
     settings_panel,
 )
@@ -143,6 +144,7 @@ class Tab(context.PageContext):
         # A timer waits for the browser, and NiceGUI then sends the unfinished page. So timers come after all pauses.
         ui.timer(readouts.UPDATE_S, self.update_lights)
         ui.timer(monte_carlo_panel.POLL_S, self.study_panel.poll)
+        ui.timer(real_panel.BLINK_S, self.photo.real.blink)
 
     async def build_panels(self) -> None:
         with widgets.div("lab-panes"):

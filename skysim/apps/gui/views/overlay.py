@@ -36,6 +36,7 @@ COLORS = {
     "identified": "#6ff0d8",
     "false": "#e8b90f",
     "windows": "#7f8a9a",
+    "residuals": "#ffff96",
 }
 KINDS = tuple(COLORS)
 KIND_BY_MARK = {kind: kind for kind in KINDS} | {"faint": "truth"}
@@ -64,6 +65,8 @@ def marks(
         (x, y, name) of identified lights
     lights
         (x, y, number or -1, whether it is a detection) of all lights that the cursor may find, detections last
+    residuals
+        (x, y, along x, along y) of identified lights: detected minus predicted
     """
     detections = result.detections if result else ()
     ids = [one.id for one in detections]
@@ -95,10 +98,15 @@ def marks(
         "marks": [
             {"kind": drawn, "color": COLORS[kind], "points": points[drawn]}
             for drawn, kind in KIND_BY_MARK.items()
-            if kind in shown and points[drawn]
+            if kind in shown and points.get(drawn)
         ],
         "names": [(*place, name(id)) for place, id in named] if "identified" in shown else [],
         "lights": true_lights + detected_lights,
+        "residuals": [
+            (one.x, one.y, *one.residual_px)
+            for one in detections
+            if one.id >= 0 and "residuals" in shown
+        ],
     }
 
 

@@ -61,6 +61,8 @@ class SensorView:
         Id of the tab, and contents of its live fields
     source
         Source of pixels, once the tab has a worker
+    well
+        Electrons per digital number, bias in digital numbers, and electrons of a full well, of a scene's detector
     hover_px
         Place of the light under the mouse, or None
     sent_number
@@ -75,6 +77,7 @@ class SensorView:
     prefix = "HIP"
     lens: Lens | None = None
     pose: Pose | None = None
+    well: tuple[float, float, float] | None = None
     statistics = ""  # numbers of the frame, shown while no light is under the mouse
     hover_px: tuple[float, float] | None = None
     sent_number = 0
@@ -121,7 +124,7 @@ class SensorView:
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")
             self.limits = self.select("Limits", LIMITS, "w-24")
-            self.colors = self.select("Colors", list(COLOR_MAPS), "w-24")
+            self.colors = self.select("Colors", list(COLOR_MAPS), "w-20")
 
     def select(self, name: str, options: Collection[str], width: str) -> ui.select:
         """A list of display settings."""
@@ -188,6 +191,10 @@ class SensorView:
             self.hover_px = None
         self.size_px = image.pixels.fields["size"]
         self.pose = image.pose
+        self.well = None
+        if isinstance(of, SceneInfo):
+            detector = of.scene.camera.detector
+            self.well = detector.gain_e_dn, detector.offset_dn, detector.full_well_e
         is_new_lens = of.lens is not self.lens
         if is_new_lens:
             self.lens = of.lens
@@ -211,7 +218,7 @@ class SensorView:
 
     def fields(self) -> Record:
         """Further data for frame.js: pointing and marks."""
-        view = {"pose": self.pose, "label": self.description()}
+        view = {"pose": self.pose, "label": self.description(), "well": self.well}
         return view | overlay.marks(self.lights, self.result, self.shown, self.name)
 
     def description(self) -> str:
@@ -263,11 +270,8 @@ class SensorView:
             ]
         if detection:
             identity = self.name(detection.id) if detection.id >= 0 else "not identified"
-            residual = (
-                ""
-                if math.isnan(detection.residual_px)
-                else f"   residual {detection.residual_px:.3f} px"
-            )
+            residual_px = math.hypot(*detection.residual_px)
+            residual = "" if math.isnan(residual_px) else f"   residual {residual_px:.3f} px"
             lines += [
                 f"centroid   {detection.x:8.2f} {detection.y:8.2f} ± {detection.sigma_px:.3f} px",
                 f"           {identity}",

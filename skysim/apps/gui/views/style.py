@@ -93,7 +93,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-keys kbd, .lab-command kbd {{ background: {COLORS["line"]}; color: {COLORS["text"]}; border-radius: 3px;
   padding: 1px 5px; font: 11px ui-monospace, monospace; margin-right: 5px }}
 .lab-sensor {{ display: grid; grid-template-rows: auto minmax(0, 1fr); min-width: 0; min-height: 0 }}
-.lab-bar {{ display: flex; flex-wrap: wrap; align-items: center; gap: 0 8px; padding: 2px 14px; min-width: 0 }}
+.lab-bar {{ display: flex; flex-wrap: wrap; align-items: center; gap: 0 4px; padding: 2px 14px; min-width: 0 }}
+.lab-bar .q-checkbox__label {{ font-size: 12.5px }}
 .lab-view {{ display: grid; grid-template: minmax(0, 1fr) 24px 176px / minmax(0, 1fr); min-width: 0; min-height: 0 }}
 .lab-frame {{ position: relative; min-height: 0; min-width: 0; margin: 0 14px; overflow: hidden }}
 .lab-frame > canvas {{ position: absolute; inset: 0; width: 100%; height: 100%; touch-action: none; cursor: crosshair }}
@@ -123,6 +124,11 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-panels .q-tab-panel > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
+.lab-timeline {{ width: 100% }} .lab-timeline .lane {{ position: relative; height: 26px;
+  border-bottom: 1px solid {COLORS["line"]} }}
+.lab-timeline span {{ position: absolute; left: 0; font-size: 11px; line-height: 14px; pointer-events: none }}
+.lab-timeline button {{ position: absolute; top: 15px; height: 9px; min-width: 5px; padding: 0; border: 0;
+  transform: translateX(-2px); cursor: pointer }}
 .lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}

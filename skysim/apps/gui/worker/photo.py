@@ -24,6 +24,7 @@ from skysim.apps import plate_solver
 from skysim.apps.gui.messages import (
     NO_LIGHTS,
     NO_PIXELS,
+    FrameView,
     Lens,
     Lights,
     Pixels,
@@ -66,6 +67,10 @@ class Photo:
         True lights of a study's trial, and the catalog of the lights' numbers (HIP or LED)
     hint
         Likely cause of a refusal, or assumption about a solved file
+    name
+        Name of the file, or of the camera
+    compared
+        Whether `angles_deg` are those of the simulation, which is compared with a real camera
     """
 
     result: TrackerResult
@@ -80,6 +85,8 @@ class Photo:
     lights: Lights = field(default_factory=lambda: NO_LIGHTS)
     prefix: str = "HIP"
     hint: str = ""
+    name: str = "camera"
+    compared: bool = False
 
 
 UNKNOWN = (math.nan,) * 3
@@ -124,24 +131,31 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     setup = trials.prepared_setup(plan.spec, segment.settings)
     lab = setup.lab
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    result = workbench.tracker_result(lab, setup.estimator, frame, truth, report)
+    bench = Workbench(lab.scene, lab, setup.estimator, lab.start, lenses.scene_lens(lab), {})
+    bench.magnitude = workbench.magnitude_by_id(lab)
+    photo = scene_photo(bench, bench.frame_view(frame, truth, report, 0.0))
     if row.error:
         status = row.error.strip().splitlines()[-1]
-        result = replace(result, row=replace(result.row, status=status, estimate_deg=None))
-    scene = lab.scene
-    photo = Photo(
-        result,
-        {},
-        plots.frame_statistics(frame.image_dn, frame.saturation_dn),
-        names=scoring.angle_names(scene),
-        angles_deg=scoring.true_angles_deg(lab.camera, truth),
-        lights=workbench.true_lights(truth, workbench.magnitude_by_id(lab)),
-        prefix=workbench.id_prefix(lab),
-        saturation_dn=frame.saturation_dn,
-        lens=(lens := lenses.scene_lens(lab)),
-        pose=lenses.scene_pose(lab, lens, truth),
-    )
+        failed = replace(photo.result.row, status=status, estimate_deg=None)
+        photo = replace(photo, result=replace(photo.result, row=failed))
     return photo, frame.image_dn
+
+
+def scene_photo(bench: Workbench, view: FrameView) -> Photo:
+    """A solved frame of a scene as an image that is not of the current scene."""
+    assert view.result is not None
+    return Photo(
+        view.result,
+        {},
+        view.statistics,
+        saturation_dn=view.saturation_dn,
+        lens=bench.lens,
+        pose=view.pose,
+        names=scoring.angle_names(bench.scene),
+        angles_deg=view.angles_deg,
+        lights=view.lights,
+        prefix=workbench.id_prefix(bench.lab),
+    )
 
 
 def solve_frame(image: NDArray, fov_deg: float | None, stages: Stages = ()) -> PhotoPixels:

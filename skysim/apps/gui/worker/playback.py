@@ -21,6 +21,7 @@ from estimator.calibration.survey_plan import SurveyAccuracy
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Report
 from skysim.apps.gui.messages import (
+    AtLimit,
     Curves,
     FlightRow,
     FlightStep,
@@ -35,7 +36,7 @@ from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.types import Bools, Floats, Frame, Mount, Telemetry
-from skysim.dynamics import guidance
+from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import (
     adjust,
     survey_findings,
@@ -47,12 +48,15 @@ from skysim.results import telemetry_report
 from skysim.results.telemetry_report import euler_deg
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import HoldConfig, SlewConfig
+from skysim.scene.sections.vehicle import VehicleConfig
 from skysim.simulation.flight import Flight, Shot
 from skysim.simulation.lab import Lab
+from skysim.simulation.motion import at_limit
 from skysim.tracking import dome_map_file, onboard_model
 from skysim.tracking import factory as tracker_settings
 
 MAX_POINTS = 500  # approximate maximum number of points of a curve on the page
+AT_STOP_DEG = 0.1  # tilt below the vehicle's stop that touches it
 FLOOR = 1e-3  # arcsec; lower limit of values on a logarithmic axis
 # Maximum size of the frames in the file; further frames are rendered again when they are shown.
 KEPT_BYTES = 2**28
@@ -116,13 +120,18 @@ class Playback:
         self.reported = len(self.frames)
         rows: list[FlightRow] = []
         drawn: Curves | None = None
+        limits: list[AtLimit] = []
+        mount = self.bench.lab.camera.mount
         if is_done or new:
             log = self.flight.telemetry()
-            rows = [frame_row(frame, log, self.bench.lab.camera.mount) for frame in new]
+            rows = [frame_row(frame, log, mount) for frame in new]
             drawn = curves(log)
-        residuals = [one for frame in new for one in light_residuals(frame.view)]
+            limits += at_limits(log, self.bench.scene.vehicle)
+        residuals = [one for frame in new for one in light_residuals(frame.view, mount)]
         flight = self.flight
-        return FlightStep(is_done, flight.now_s, flight.duration_s, rows, drawn, residuals)
+        return FlightStep(
+            is_done, flight.now_s, flight.duration_s, rows, drawn, residuals, limits
+        )
 
     def add(self, shot: Shot) -> None:
         """Keep a shot, and its pixels if the file has room."""
@@ -190,15 +199,34 @@ def frame_row(kept: KeptFrame, log: Telemetry, mount: Mount) -> FlightRow:
         if cam_from_lab is not None:
             lab_from_body = cam_from_lab.inv() * mount.cam_from_body
             innovation_arcsec = angle_arcsec(lab_from_body, lab_from_filter)
-    return FlightRow(result.row, len(view.lights), filter_arcsec, innovation_arcsec)
+    counts = len(view.lights), view.statistics.saturated
+    return FlightRow(result.row, *counts, filter_arcsec, innovation_arcsec)
 
 
-def light_residuals(view: FrameView) -> Iterator[Residual]:
+def at_limits(log: Telemetry, vehicle: VehicleConfig) -> Iterator[AtLimit]:
+    """The times at which actuators, gyros or the tilt were at their limits, by the flight's telemetry."""
+    masks = {f"{name} limit": full for name, full in at_limit(log.loads).items()}
+    if log.saturated is not None:
+        masks["gyro limit"] = log.saturated
+    if vehicle.mount == "air_bearing":
+        least_deg = vehicle.tilt_stop_deg - AT_STOP_DEG
+        masks["tilt stop"] = multibody.tilt_deg(log.lab_from_body) > least_deg
+    for name, mask in masks.items():
+        ends = np.flatnonzero(np.diff([False, *mask, False]))
+        for first, end in ends.reshape(-1, 2):
+            yield name, float(log.t_s[first]), float(log.t_s[end - 1])
+
+
+def light_residuals(view: FrameView, mount: Mount) -> Iterator[Residual]:
     """The residual of every light that is identified in a frame."""
     assert view.result is not None
+    lab_from_cam = quaternion.to_rotation(view.body_wxyz) * mount.cam_from_body.inv()
+    across_lab = lab_from_cam.as_matrix()[:, :2]  # directions of x and y
     for spot in view.result.detections:
-        if spot.id >= 0 and math.isfinite(spot.residual_px):
-            yield view.result.row.t_s, spot.id, spot.residual_px
+        px = math.hypot(*spot.residual_px)
+        if spot.id >= 0 and math.isfinite(px):
+            lab_px = tuple((across_lab @ spot.residual_px).tolist())
+            yield Residual(view.result.row.t_s, spot.id, px, lab_px)
 
 
 def curves(log: Telemetry) -> Curves:

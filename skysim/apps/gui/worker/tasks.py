@@ -24,9 +24,9 @@ from skysim.apps.gui.worker import (
     photo,
     pixels,
     playback,
+    real,
 )
 from skysim.apps.gui.worker.workbench import Workbench, ambiguity
-from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.simulation import checks
@@ -53,8 +53,10 @@ class Worker:
         Survey of the scene's dome, if one was planned
     other
         Image that is not of the scene, if the page shows one, and its (H, W) pixels
-    camera
-        Open live camera
+    source
+        Folder that is watched, or open camera
+    compared
+        Its frames beside those of the scene
     """
 
     current: Workbench | None = None
@@ -67,7 +69,8 @@ class Worker:
     other: photo.PhotoPixels | None = None
     scene: str = ""
     overrides: dict[str, str] = field(default_factory=dict)
-    camera: images.LiveCamera | None = None
+    source: real.Source | None = None
+    compared: real.Comparison | None = None
 
     @property
     def workbench(self) -> Workbench:
@@ -247,18 +250,52 @@ class Worker:
     ) -> photo.Photo:
         return self.show_photo(photo.photo_from_file(name, data, fov_deg, stages))
 
-    def solve_camera(
-        self, source: str, fov_deg: float | None, stages: photo.Stages = ()
-    ) -> photo.Photo:
-        """Solve the next frame of a live camera, which stays open."""
-        if self.camera is None:
-            self.camera = images.LiveCamera(source)
-        return self.show_photo(
-            photo.solve_frame(images.monochrome(self.camera.frame()), fov_deg, stages)
-        )
+    def solve_next(
+        self,
+        source: str,
+        fov_deg: float | None,
+        stages: photo.Stages = (),
+        as_scene: bool = False,
+        follow: bool = False,
+    ) -> photo.Photo | bool:
+        """Solve the next frame of a source, which stays open; False if there is none yet.
+
+        Parameters
+        ----------
+        as_scene
+            Whether it is of the scene's camera, else of any camera under the sky
+        follow
+            Whether the scene takes its attitude
+        """
+        if self.source is None:
+            self.source = real.Source(source)
+        found = self.source.picture()
+        if found is None:
+            return False
+        if as_scene:
+            return self.show_photo(self.comparison.solve(self.workbench, *found, follow))
+        name, picture = found
+        solved, image = photo.solve_frame(picture.pixels, fov_deg, stages)
+        return self.show_photo((replace(solved, name=name), image))
+
+    @property
+    def comparison(self) -> real.Comparison:
+        """The real frames of the scene."""
+        scene = self.workbench.scene
+        if self.compared is None or self.compared.scene != scene:
+            self.compared = real.Comparison(scene)
+        return self.compared
+
+    def real_view(self, name: str) -> photo.Photo:
+        """The newest real frame as one of REAL_VIEWS."""
+        return self.show_photo(self.comparison.show(name))
+
+    def explain(self) -> str:
+        """What would explain the residuals of the real frames."""
+        return self.comparison.explain()
 
     def release(self) -> None:
-        """Close the live camera."""
-        if self.camera:
-            self.camera.close()
-        self.camera = None
+        """Close the source."""
+        if self.source:
+            self.source.close()
+        self.source = None

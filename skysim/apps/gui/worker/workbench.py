@@ -249,10 +249,10 @@ def tracker_result(
 
 
 def detections_of(estimator: factory.Estimator, report: Report) -> tuple[Detection, ...]:
-    """Detections with the numbers of their matched lights, and the distances from the predicted positions of these."""
+    """Detections with the numbers of their matched lights, and their places relative to the predicted ones of these."""
     centroids = report.centroids
     ids = np.full(len(centroids.flux), -1)
-    residual_px = np.full(len(ids), math.nan)
+    residual_px = np.full((len(ids), 2), math.nan)
     attitude = report.attitude
     if (
         attitude.match is not None
@@ -263,9 +263,10 @@ def detections_of(estimator: factory.Estimator, report: Report) -> tuple[Detecti
         rows = attitude.match.observed
         light = attitude.match.star
         ids[rows] = light_ids[light]
-        residual_px[rows] = np.hypot(*(predicted_px[light] - centroids.xy_px[rows]).T)
-    columns = (*centroids.xy_px.T, centroids.sigma_px, centroids.flux, ids, residual_px)
-    return tuple(map(Detection, *(column.tolist() for column in columns)))
+        residual_px[rows] = centroids.xy_px[rows] - predicted_px[light]
+    columns = (*centroids.xy_px.T, centroids.sigma_px, centroids.flux, ids)
+    vectors_px = map(tuple, residual_px.tolist())
+    return tuple(map(Detection, *(column.tolist() for column in columns), vectors_px))
 
 
 def predicted_lights(
@@ -276,13 +277,11 @@ def predicted_lights(
     If the solution has its own camera (the field of view was fitted), that camera is used.
     """
     assert attitude.cam_from_ref is not None
+    camera = attitude.camera or estimator.camera
     if isinstance(estimator, DomeTracker):
         body_from_lab = estimator.lever.cam_from_body.inv() * attitude.cam_from_ref
         places = estimator.leds.position_m
-        return estimator.leds.id, project(
-            body_from_lab, places, estimator.lever, estimator.camera
-        )
-    camera = attitude.camera or estimator.camera
+        return estimator.leds.id, project(body_from_lab, places, estimator.lever, camera)
     return estimator.stars.id, camera.pixels(
         attitude.cam_from_ref.apply(estimator.stars.vectors)
     )

@@ -2,8 +2,8 @@
 // without the server. Marks are drawn together with their frame, so that they never appear on another one.
 import { setContents } from "skysim-views/live.js";
 import { colorTable, decode, palette, profile, reader, shadeTable } from "skysim-views/pixels.js";
-import { drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-views/marks.js";
-import { drawHistogram, drawProfile, levelAt, nearestLevel } from "skysim-views/plots.js";
+import { drawArrows, drawGrid, drawHighlight, drawLoupe, drawMarks, drawNames } from "skysim-views/marks.js";
+import { brief, drawHistogram, drawProfile, electrons, levelAt, nearestLevel } from "skysim-views/plots.js";
 import { directionText, gridLines } from "skysim-views/sky.js";
 
 const REST_MS = 400; // without another frame, after which all pixels of the frame are fetched
@@ -315,6 +315,7 @@ export default {
       pen.strokeRect(left - 0.5, top - 0.5, size[0] * scale + 1, size[1] * scale + 1);
       if (this.display.grid) drawGrid(pen, this.lines(), this.toScreen, window, GRID);
       drawMarks(pen, marks, this.toScreen);
+      canvas.dataset.arrows = drawArrows(pen, this.drawn.residuals, size[0], this.toScreen, window);
       drawNames(pen, names, this.toScreen, window, NAME);
       if (this.cut) this.paintCut(pen);
       const ringed = lights.find((light) => light[2] === this.hovered && light[2] >= 0);
@@ -374,11 +375,28 @@ export default {
         plot.dataset.profile = found.values.map((dn) => dn.toFixed(1)).join(" ");
         plot.ariaLabel = `profile of the cut, ${found.values.length} values`;
       } else if (pen) {
-        this.axis = drawHistogram(pen, this.drawn, this.levels, [plot.clientWidth, plot.clientHeight]);
+        const peaks = this.peaks();
+        this.axis = drawHistogram(pen, this.drawn, this.levels, [plot.clientWidth, plot.clientHeight], peaks);
         plot.ariaLabel = `histogram; limits ${limits.map((dn) => dn.toFixed(1)).join(" to ")} DN`;
+        if (this.drawn.well && peaks.length) {
+          const most = electrons(offset + step * Math.max(...peaks), this.drawn.well);
+          plot.ariaLabel += `; brightest pixel of ${peaks.length} lights ${most.toFixed(0)} of ${this.drawn.well[2]} electrons`;
+        }
       }
       this.paintLoupe();
       this.writeReadout();
+    },
+    // The greatest level of the pixels about each detection, if all pixels are here.
+    peaks() {
+      const { lights, isWhole, pixels: { data }, size: [width, height] } = this.drawn;
+      if (!isWhole) return [];
+      return lights.filter((light) => light[3]).map(([x, y]) => {
+        let most = 0;
+        for (let row = Math.round(y) - 1; row <= Math.round(y) + 1; row++)
+          for (let column = Math.round(x) - 1; column <= Math.round(x) + 1; column++)
+            if (row >= 0 && row < height && column >= 0 && column < width) most = Math.max(most, data[row * width + column]);
+        return most;
+      });
     },
     paintLoupe() {
       const corner = this.loupeAt();
@@ -407,7 +425,9 @@ export default {
       }
       const number = this.drawn.pixels.step === 1 ? dn.toFixed(0) : dn.toFixed(2);
       const place = `x ${at[0].toFixed(1)}  y ${at[1].toFixed(1)}`.padEnd(20);
-      readout.textContent = `${place}${number.padStart(6)} DN   ${directionText(this.drawn, at[0], at[1])}`;
+      const { well } = this.drawn, charge = well ? electrons(dn, well) : 0;
+      const share = well ? ` ${brief(charge)} e⁻ ${((100 * charge) / well[2]).toFixed(0)} %` : "";
+      readout.textContent = `${place}${number.padStart(6)} DN${share}   ${directionText(this.drawn, at[0], at[1])}`;
     },
 
     // Mouse and touch on the frame.

@@ -87,6 +87,46 @@ export function write(pen, text, [x, y], color) {
   pen.fillText(text, x, y);
 }
 
+// The factor by which residuals are enlarged so that their median has a wanted length, the next greater of 1, 2, 5 times
+// a power of ten; the longest residual that is drawn in full, so that a wrong match does not cover the others; and both
+// in words.
+const LONGEST = 8, LEAST_PX = 1e-6;
+export function arrowScale(lengths, wanted) {
+  if (!lengths.length) return { factor: 1, longest: 1, text: "" };
+  const sorted = [...lengths].sort((a, b) => a - b), half = (sorted.length - 1) / 2;
+  const median = (sorted[Math.floor(half)] + sorted[Math.ceil(half)]) / 2, least = wanted / Math.max(median, LEAST_PX);
+  const decade = 10 ** Math.floor(Math.log10(least)), factor = [1, 2, 5, 10].find((step) => step * decade >= least) * decade;
+  const longest = LONGEST * Math.max(median, LEAST_PX), cut = lengths.filter((length) => length > longest).length;
+  const shortened = cut ? `; ${cut} shortened, up to ${sorted.at(-1).toPrecision(3)} px` : "";
+  const text = `arrows × ${Number(factor.toPrecision(1))}, median ${median.toPrecision(3)} px of ${lengths.length}${shortened}`;
+  return { factor, longest, text };
+}
+
+// Residuals [x, y, along x, along y] as arrows, and their scale at the lower edge, which is returned. wide: of the frame
+const ARROW = "#ffff96", SHORTENED = "#ffab1a", HEAD = 4, SHARE = 0.025; // least median arrow over the frame's width
+export function drawArrows(pen, residuals, wide, toScreen, [, height]) {
+  const lengths = residuals.map(([, , dx, dy]) => Math.hypot(dx, dy));
+  const { factor, longest, text } = arrowScale(lengths, SHARE * wide);
+  residuals.forEach(([x, y, dx, dy], n) => {
+    const isShortened = lengths[n] > longest, scale = isShortened ? (factor * longest) / lengths[n] : factor;
+    const from = toScreen(x, y), to = toScreen(x + scale * dx, y + scale * dy), turn = Math.atan2(to[1] - from[1], to[0] - from[0]);
+    const barbs = [2.6, -2.6].map((side) => [to[0] + HEAD * Math.cos(turn + side), to[1] + HEAD * Math.sin(turn + side)]);
+    for (const [color, wide] of [["rgb(13 16 21 / 80%)", 3.6], [isShortened ? SHORTENED : ARROW, 1.6]]) {
+      pen.strokeStyle = color;
+      pen.lineWidth = wide;
+      pen.beginPath();
+      pen.moveTo(...from);
+      pen.lineTo(...to);
+      pen.moveTo(...barbs[0]);
+      pen.lineTo(...to);
+      pen.lineTo(...barbs[1]);
+      pen.stroke();
+    }
+  });
+  if (text) write(pen, text, [6, height - 6], ARROW);
+  return text;
+}
+
 export function drawGrid(pen, lines, toScreen, [width, height], color) {
   pen.strokeStyle = color;
   pen.lineWidth = 1;

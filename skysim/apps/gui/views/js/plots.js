@@ -1,6 +1,7 @@
 // The plot under the frame: a histogram with the two display limits, or the profile of a cut.
 
 const MARGIN = { left: 4, right: 4, top: 16, bottom: 16 };
+const PEAK = "#6ff0d8", FULL = "#dd5a60";
 const QUIET = "#8b95a5", BAR = "#62758f", LIMIT = "#f0b429";
 
 // The axis is an inverse hyperbolic sine about the sky, in units of its scatter, see `histogram` in worker/pixels.py.
@@ -15,7 +16,9 @@ function axisOf({ sky, scatter, range }, width) {
   };
 }
 
-export function drawHistogram(pen, { pixels, histogram }, levels, [width, height]) {
+// well: [electrons per digital number, bias in digital numbers, electrons of a full well], of a scene's detector;
+// peaks: the brightest pixel of each light, in levels, drawn as ticks over the bars
+export function drawHistogram(pen, { pixels, histogram, well }, levels, [width, height], peaks) {
   const axis = axisOf(histogram, width), { counts } = histogram;
   const most = Math.log1p(Math.max(...counts)), room = height - MARGIN.top - MARGIN.bottom;
   pen.clearRect(0, 0, width, height);
@@ -35,9 +38,24 @@ export function drawHistogram(pen, { pixels, histogram }, levels, [width, height
   });
   pen.textAlign = "left";
   pen.fillStyle = QUIET;
-  pen.fillText("drag the limits", MARGIN.left, 11);
+  if (!well) {
+    pen.fillText("drag the limits", MARGIN.left, 11);
+    return axis;
+  }
+  const [, , full] = well, inElectrons = (level) => electrons(pixels.offset + pixels.step * level, well);
+  pen.fillStyle = PEAK;
+  for (const peak of peaks) pen.fillRect(axis.at(peak) - 0.5, MARGIN.top, 1.5, 7);
+  const brightest = inElectrons(Math.max(histogram.range[1], ...peaks));
+  pen.fillStyle = QUIET;
+  pen.fillText(`${brief(brightest)} e⁻ of ${brief(full)}: ${((100 * brightest) / full).toPrecision(3)} %`, MARGIN.left, 11);
+  const at = axis.at((full / well[0] + well[1] - pixels.offset) / pixels.step);
+  pen.fillStyle = FULL;
+  if (at < width) pen.fillRect(at - 1, MARGIN.top, 2, room); // the full well
   return axis;
 }
+
+export const electrons = (dn, [gain, bias]) => Math.max(0, gain * (dn - bias));
+export const brief = (e) => (e < 1e4 ? e.toFixed(0) : `${(e / 1000).toPrecision(3)} k`);
 
 // Which of the two limits is nearer to a place on the axis.
 export function nearestLevel(axis, levels, x) {

@@ -9,6 +9,7 @@ const BUSY_MS = 1000, SMOOTH_MS = 33; // between pictures without a graphics car
 const REACH_PX = 12;
 const PULL_MS = 40; // between two messages of a drag
 const NEAR_M = 0.02, FAR_M = 60;
+const ARROW = 0xff5fa8;
 const INSIDE = ["camera", "bearing"]; // views in which vehicle and axes would be in the way
 
 export default {
@@ -47,9 +48,11 @@ export default {
     this.sight = new IntersectionObserver((entries) => this.see(entries.at(-1).isIntersecting));
     this.sight.observe(this.$el);
     window.addEventListener("skysim-hover", this.ring);
+    window.addEventListener("skysim-arrows", this.drawArrows);
   },
   beforeUnmount() {
     window.removeEventListener("skysim-hover", this.ring);
+    window.removeEventListener("skysim-arrows", this.drawArrows);
     this.watcher?.disconnect();
     this.sight?.disconnect();
     this.renderer?.dispose();
@@ -72,6 +75,7 @@ export default {
       for (const shape of lab.shapes) (shape.on_vehicle ? this.vehicle : this.world).add(solid(shape));
       this.named = [];
       this.newest = "";
+      this.$refs.canvas.dataset.arrows = 0;
       this.paintLights();
       this.look(this.preset);
     },
@@ -94,6 +98,23 @@ export default {
     color(pairs) {
       this.lights.colors = new Map(pairs);
       this.paintLights();
+      this.draw();
+    },
+    // Arrows at some lights: [number, along x, y, z as an angle seen from the middle of the laboratory] each.
+    drawArrows({ detail: { arrows } }) {
+      if (!this.vehicle) return;
+      this.world.remove(this.arrowLines);
+      const index = new Map(this.lab.lights.id.map((id, n) => [id, n])), ends = [];
+      for (const [id, along] of arrows) {
+        if (!index.has(id)) continue;
+        const from = new THREE.Vector3().fromArray(this.lab.lights.place, 3 * index.get(id));
+        ends.push(from, from.clone().addScaledVector(new THREE.Vector3(...along), from.length()));
+      }
+      const material = new THREE.LineBasicMaterial({ color: ARROW });
+      this.arrowLines = new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(ends), material);
+      this.arrowLines.frustumCulled = false;
+      this.world.add(this.arrowLines);
+      this.$refs.canvas.dataset.arrows = ends.length / 2;
       this.draw();
     },
     // Look from a preset: [eye, target, up, vertical field in degrees, whether they are in body axes].

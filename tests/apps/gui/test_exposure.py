@@ -1,0 +1,63 @@
+"""The histogram's electrons against the full well, and the brightest pixel of each light."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from tests.helpers.labpage import (
+    CHROMIUM,
+    NARROW,
+    Server,
+    chosen,
+    come,
+    exported,
+    opened,
+    pictured,
+    screen,
+    status,
+)
+
+pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
+
+from skysim.scene import loader
+
+pytest_plugins = ["tests.helpers.labpage"]
+in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+
+
+@pytest.mark.browser
+@in_browser
+@pytest.mark.parametrize("name", ["shefex2", "afit_simsat"])
+def test_the_brightest_light_is_compared_with_the_full_well(
+    browser: Any, server: Server, tmp_path: Path, name: str
+) -> None:
+    detector = loader.load(name).camera.detector
+    with opened(browser, server.login, NARROW) as page:
+        if name != "shefex2":
+            chosen(page, "Scene", name)
+            page.get_by_text("AFIT SimSat under its measured dome").wait_for()
+            status(page, "solved")
+        plot = page.locator(".lab-plot")
+        told = re.compile(r"brightest pixel of (\d+) lights (\d+) of (\d+) electrons")
+        assert come(lambda: told.search(str(plot.get_attribute("aria-label"))) is not None)
+        count, most, full = map(int, told.search(plot.get_attribute("aria-label")).groups())
+        image = fits.getdata(exported(page, "frame, FITS", tmp_path))
+        top_e = detector.gain_e_dn * (float(image.max()) - detector.offset_dn)
+        assert most == pytest.approx(top_e, abs=1)
+        assert full == detector.full_well_e
+        assert count > 5
+        # The value under the cursor in electrons.
+        row, column = np.unravel_index(np.argmax(image), image.shape)
+        pictured(page, f"exposure_{name}")
+        page.mouse.move(*screen(page, float(column), float(image.shape[0] - 1 - row)))
+        share = f"{100 * top_e / detector.full_well_e:.0f} %"
+        page.mouse.move(*screen(page, float(column), float(row)))
+        readout = page.locator(".lab-readout span")
+        assert come(lambda: share in readout.inner_text() or "DN" in readout.inner_text())
+        assert " e⁻ " in readout.inner_text()
