@@ -75,7 +75,7 @@ def compared(worker: Worker, folder: Path, follow: bool) -> Any:
 
 
 def test_a_file_is_taken_when_it_is_complete_and_once(tmp_path: Path) -> None:
-    source = real.Source(str(tmp_path))
+    source = real.RealSource(str(tmp_path))
     assert source.picture() is None
     image = np.full((20, 30), 7, np.uint16)
     cv2.imwrite(str(tmp_path / "b.png"), image)

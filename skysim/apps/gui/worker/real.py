@@ -39,7 +39,7 @@ CLEAR_SIGMAS = 3.0  # change over its standard error from which it is no chance
 LIGHT_SIGMAS = 5.0  # scatter of the sky above which a pixel counts as light
 
 
-class Source:
+class RealSource:
     """The pictures of a folder that is watched, or of a camera, a video or an address.
 
     Attributes
@@ -71,7 +71,7 @@ class Source:
             self.camera.close()
 
 
-class Comparison:
+class RealComparison:
     """Frames of a real camera by the tracker of a scene.
 
     Attributes
@@ -201,6 +201,6 @@ def explanation(run: SurveyRun, prior: CalibrationPrior, before_px: float) -> st
         f"{what} {change:+.2f} ± {sigma:.2g}" for what, change, sigma in changes
     )
     return (
-        f"{len(run.frames)} of {len(run.taken)} frames are connected, residuals {before_px:.2g} px rms before and"
+        f"{len(run.matches)} of {len(run.taken)} frames are connected, residuals {before_px:.2g} px rms before and"
         f" {found['rms_px']:.2g} px after. Found minus assumed, the most significant first: {listed}.{first}"
     )

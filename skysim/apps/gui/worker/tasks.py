@@ -69,8 +69,8 @@ class Worker:
     other: photo.PhotoPixels | None = None
     scene: str = ""
     overrides: dict[str, str] = field(default_factory=dict)
-    source: real.Source | None = None
-    compared: real.Comparison | None = None
+    source: real.RealSource | None = None
+    compared: real.RealComparison | None = None
 
     @property
     def workbench(self) -> Workbench:
@@ -268,7 +268,7 @@ class Worker:
             Whether the scene takes its attitude
         """
         if self.source is None:
-            self.source = real.Source(source)
+            self.source = real.RealSource(source)
         found = self.source.picture()
         if found is None:
             return False
@@ -279,11 +279,11 @@ class Worker:
         return self.show_photo((replace(solved, name=name), image))
 
     @property
-    def comparison(self) -> real.Comparison:
+    def comparison(self) -> real.RealComparison:
         """The real frames of the scene."""
         scene = self.workbench.scene
         if self.compared is None or self.compared.scene != scene:
-            self.compared = real.Comparison(scene)
+            self.compared = real.RealComparison(scene)
         return self.compared
 
     def real_view(self, name: str) -> photo.Photo:
