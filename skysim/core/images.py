@@ -32,6 +32,7 @@ from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_pixels, silent_stderr
 from skysim.core.errors import InputError, reason
 from skysim.core.guarded import run_guarded
+from skysim.core.text import LARGEST
 from skysim.core.types import Record, frozen
 from skysim.core.yaml_reader import check_bytes
 
@@ -355,6 +356,11 @@ def read_pictures(path: Path) -> list[ViewedImage]:
             raise InputError(
                 path, f"pixels of type {page.pixels.dtype}", "integers and floats"
             )
+        if page.pixels.dtype.kind == "f":
+            finite = page.pixels[np.isfinite(page.pixels)]
+            largest = max(finite.max(initial=0), -finite.min(initial=0))
+            if largest > LARGEST:
+                raise InputError(path, f"pixels up to {largest:.3g}", f"up to {LARGEST:g}")
     return pages
 
 
@@ -412,7 +418,7 @@ def as_light(picture: ViewedImage) -> ViewedImage:
     if is_float and pixels.size and pixels.max() <= 1:
         change = np.abs(np.diff(pixels.astype(np.float64)))
         noise = np.median(change) * SIGMA_PER_MAD / math.sqrt(2) if change.size else 0.0
-        scale = float(NOISE_E / noise) if noise > 0 else WHOLE_SCALE
+        scale = float(NOISE_E / noise) if noise > 1 / LARGEST else WHOLE_SCALE
         pixels = pixels * scale
         notes.append(
             f"floats up to 1, scaled by {scale:.4g}: the gain is estimated, {NOISE_E:g} e- of noise are assumed"

@@ -68,6 +68,9 @@ MAP_META = {
 }
 
 
+ROUNDING = 1e-5  # of a map's variances, of the greatest
+
+
 def write_dome_map(path: Path, dome: DomeMap) -> None:
     """Write a surveyed dome as ECSV: one row for each LED, the camera in the header.
 
@@ -157,8 +160,13 @@ def read_covariance(path: Path, table: Any) -> dict[str, Floats]:
     finite = np.isfinite(found["own_m2"]).all((1, 2)) & np.isfinite(found["common_m"]).all(
         (0, 2)
     )
-    if not finite.all():
+    variances_m2 = np.linalg.eigvalsh(np.where(finite[:, None, None], found["own_m2"], 0.0))
+    # They are kept with 4 bytes a number.
+    valid = finite & (variances_m2[:, 0] >= -ROUNDING * variances_m2[:, -1])
+    if not valid.all():
         raise InputError(
-            path, f"row {np.argmin(finite) + 1}: its covariance", "finite numbers"
+            path,
+            f"row {np.argmin(valid) + 1}: its covariance",
+            "finite numbers, and no variance below 0",
         )
     return found

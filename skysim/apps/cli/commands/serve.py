@@ -276,10 +276,13 @@ def open_output(opening: Opening, name: str, value: Any) -> None:
 
 def summary(statistics: dict[str, Any]) -> str:
     """Text summary of the frames rendered, sent and dropped, and of the control periods."""
+    delay = (
+        f"; delay: median {statistics['late_ms_median']:.1f} ms,"
+        f" p99 {statistics['late_ms_p99']:.1f} ms, worst {statistics['late_ms_worst']:.1f} ms"
+    )
+    made = statistics["made"]
     lines = [
-        f"{statistics['made']} frames rendered, {statistics['dropped']} dropped; delay: median"
-        f" {statistics['late_ms_median']:.1f} ms, p99 {statistics['late_ms_p99']:.1f} ms,"
-        f" worst {statistics['late_ms_worst']:.1f} ms",
+        f"{made} frames rendered, {statistics['dropped']} dropped{delay if made else ''}",
         f"{statistics['periods']} control periods, {statistics['missed']} late by one or more",
     ]
     commands = statistics["commands"]
