@@ -40,48 +40,34 @@ from estimator.attitude.solvers import quest
 from estimator.core.checks import Floats
 from estimator.core.vectors import normalized
 
-# Largest number of iterations of tappe and ray_on_surface, and the rotation below which they stop.
+# Largest number of iterations of the methods that place points, and the rotation below which they stop.
 MAX_UPDATES = 20
 CONVERGED_RAD = 1e-13
 
-
-def _wahba(
-    point_body_m: Floats, distance_m: Floats, sigma_rad: Floats, position_m: Floats
-) -> Rotation:
-    """Return body_from_lab from points in body axes and in the lab, by their directions from the bearing center.
-
-    A ray error of sigma at the camera displaces the point by sigma * distance. Its direction from the center changes
-    by sigma * distance / radius, which sets the weights of Wahba's problem.
-
-    Parameters
-    ----------
-    point_body_m
-        (N, 3) points from the bearing center, in body axes
-    distance_m
-        (N,) distance of each point from the camera
-    position_m
-        (N, 3) the same points in the lab frame
-    """
-    radius = np.linalg.norm(point_body_m, axis=1)
-    observed = point_body_m / radius[:, None]
-    target = normalized(position_m)
-    return quest(observed, target, sigma_rad * distance_m / radius)
+# (N, 3) points from the bearing center, in body axes; the (N,) distance of each from the camera; by_ray, (N, 3, 3)
+# dp/du, the derivative of a point with respect to its ray u; and by_rotation, (N, 3) derivative of the point's distance
+# along u with respect to the attitude, 0 where the method does not use the attitude to place the point
+Points = tuple[Floats, Floats, Floats, Floats | float]
 
 
-def _with_covariance(
-    body_from_lab: Rotation,
-    point_body_m: Floats,
-    distance_m: Floats,
+def _from_points(
+    place: Callable[[Rotation], Points],
+    rays_body: Floats,
     sigma_rad: Floats,
     position_m: Floats,
-    rays_body: Floats,
-    by_ray_m: Floats,
-    by_rotation_m: Floats | float = 0.0,
+    body_from_lab: Rotation,
 ) -> tuple[Rotation, Floats]:
-    """Return a solution of `_wahba` with its (3, 3) covariance in body axes, rad^2, from the noise of the rays.
+    """Return body_from_lab and its (3, 3) covariance in body axes, rad^2, from points on the rays, by their directions.
 
-    At the minimum of Wahba's loss its gradient vanishes: sum(k a x d) = 0, with a = A P / |P|, d = p / |p| and the
-    weight k. To first order, ray noise du causes the rotation w that keeps the gradient zero (derived here):
+    Until the attitude converges (at once, where the points do not depend on it):
+
+    a. Place a point p on each ray, at the last attitude.
+    b. Solve Wahba's problem for the points' directions d from the bearing center. A ray error of sigma at the camera
+       displaces a point by sigma * distance, and its direction by sigma * distance / radius, which sets the weights k.
+
+    The covariance is from the noise of the rays. At the minimum of Wahba's loss its gradient vanishes:
+    sum(k a x d) = 0, with a = A P / |P|, d = p / |p|. To first order, ray noise du causes the rotation w that keeps the
+    gradient zero (derived here):
 
         sum(k [(a.d) I - a d^T]) w = sum(k a x (I - d d^T) dp / |p|),    dp = by_ray du + u (by_rotation . w).
 
@@ -92,17 +78,23 @@ def _with_covariance(
 
     Parameters
     ----------
-    rays_body
-        (N, 3) unit vectors u in body axes
-    by_ray_m
-        (N, 3, 3) dp/du, the derivative of a point p with respect to its ray u
-    by_rotation_m
-        (N, 3) derivative of the point's distance along u with respect to the attitude; 0 where
-        the method does not use the attitude to place the point
+    place
+        Function of an attitude that returns the Points
+    rays_body, position_m
+        (N, 3) unit vectors u in body axes, and (N, 3) the same points in the lab frame
     """
-    radius = np.linalg.norm(point_body_m, axis=1)
-    d = point_body_m / radius[:, None]
-    a = body_from_lab.apply(normalized(position_m))
+    target = normalized(position_m)
+    for _ in range(MAX_UPDATES):
+        # a. Points. They change little with the attitude, so a few updates converge.
+        point_m, distance_m, by_ray_m, by_rotation_m = place(body_from_lab)
+        radius = np.linalg.norm(point_m, axis=1)
+        d = point_m / radius[:, None]
+        # b. Attitude
+        previous = body_from_lab
+        body_from_lab = quest(d, target, sigma_rad * distance_m / radius)
+        if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
+            break
+    a = body_from_lab.apply(target)
     weight = (radius / (sigma_rad * distance_m)) ** 2  # k
     # 1. Columns of G: derivative of a point's term k a x d by a shift along each axis.
     across_point = np.eye(3) - np.einsum("ni,nj->nij", d, d)
@@ -114,9 +106,8 @@ def _with_covariance(
     hessian -= gradient_along_ray.T @ (by_rotation_m * np.ones_like(gradient_along_ray))
     # 3. Rotation by a ray's noise; a unit vector has noise only across itself.
     across_ray = np.eye(3) - np.einsum("ni,nj->nij", rays_body, rays_body)
-    response = (
-        np.linalg.solve(hessian, gradient @ by_ray_m @ across_ray) * sigma_rad[:, None, None]
-    )
+    response = np.linalg.solve(hessian, gradient @ by_ray_m @ across_ray)
+    response *= sigma_rad[:, None, None]
     # 4. Covariance
     return body_from_lab, np.einsum("nij,nkj->ik", response, response)
 
@@ -137,14 +128,9 @@ def infinity(
     (reference, section 5).
     """
     rays = lever.body_from_cam.apply(rays_cam)
-    at_infinity = np.ones(
-        len(rays)
-    )  # equal radius and distance: the weights are those of the rays
-    body_from_lab = _wahba(rays, at_infinity, sigma_rad, position_m)
-    by_ray_m = np.tile(np.eye(3), (len(rays), 1, 1))
-    return _with_covariance(
-        body_from_lab, rays, at_infinity, sigma_rad, position_m, rays, by_ray_m
-    )
+    # Equal radius and distance: the weights are those of the rays.
+    points = rays, np.ones(len(rays)), np.tile(np.eye(3), (len(rays), 1, 1)), 0.0
+    return _from_points(lambda _: points, rays, sigma_rad, position_m, body_from_lab)
 
 
 def thesis_points(rays_cam: Floats, leds: LedMap, lever: Lever) -> tuple[Floats, float]:
@@ -199,17 +185,15 @@ def thesis(
     R_body_from_cam = lever.body_from_cam.as_matrix()
     point = point_cam @ R_body_from_cam.T + lever.camera_body_m
     distances_m = np.full(len(rays_cam), distance_m)
-    # 3. Wahba's problem
-    body_from_lab = _wahba(point, distances_m, sigma_rad, position_m)
     # dp/du by the chain rule: of the point by the tangents (eqs 43-44), then of the tangents by the ray.
     by_tangent = np.zeros((len(rays_cam), 3, 2))
     by_tangent[:, [0, 1], [0, 1]] = distance_m
     by_tangent[:, 2, :] = -distance_m * point_cam[:, :2] / point_cam[:, 2:]
     by_ray_m = R_body_from_cam @ by_tangent @ tangent_gradients(rays_cam) @ R_body_from_cam.T
+    # 3. Wahba's problem
+    points = point, distances_m, by_ray_m, 0.0
     rays = rays_cam @ R_body_from_cam.T
-    return _with_covariance(
-        body_from_lab, point, distances_m, sigma_rad, position_m, rays, by_ray_m
-    )
+    return _from_points(lambda _: points, rays, sigma_rad, position_m, body_from_lab)
 
 
 def tappe(
@@ -234,24 +218,18 @@ def tappe(
     about M / R times the square of the field's half-angle. The true attitude is the fixed point: there is no bias.
     """
     rays = lever.body_from_cam.apply(rays_cam)
-    for _ in range(MAX_UPDATES):
-        # 1. Distances. They change little with the attitude, so a few updates converge.
-        distance_m = np.linalg.norm(
-            body_from_lab.apply(position_m) - lever.camera_body_m, axis=1
-        )
+
+    def place(last: Rotation) -> Points:
+        # 1. Distances
+        distance_m = np.linalg.norm(last.apply(position_m) - lever.camera_body_m, axis=1)
         # 2. Points from the bearing
         point = lever.camera_body_m + distance_m[:, None] * rays
-        previous = body_from_lab
-        # 3. Attitude
-        body_from_lab = _wahba(point, distance_m, sigma_rad, position_m)
-        if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
-            break
-    # p = c + alpha u, alpha = |b - c|: dp/du = alpha I, and a rotation w changes alpha by u.(w x p) = w.(p x u).
-    by_ray_m = distance_m[:, None, None] * np.eye(3)
-    by_rotation_m = np.cross(point, rays)
-    return _with_covariance(
-        body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m
-    )
+        # p = c + alpha u, alpha = |b - c|: dp/du = alpha I, and a rotation w changes alpha by u.(w x p) = w.(p x u).
+        by_ray_m = distance_m[:, None, None] * np.eye(3)
+        return point, distance_m, by_ray_m, np.cross(point, rays)
+
+    # 3. Attitude
+    return _from_points(place, rays, sigma_rad, position_m, body_from_lab)
 
 
 def ray_on_surface(
@@ -274,30 +252,26 @@ def ray_on_surface(
     obliquely.
     """
     rays = lever.body_from_cam.apply(rays_cam)
-    for _ in range(MAX_UPDATES):
+
+    def place(last: Rotation) -> Points:
         # 1. Intersections, in the lab frame
-        origin = body_from_lab.inv().apply(lever.camera_body_m)
-        intersection_m = on_surface(body_from_lab.inv().apply(rays), origin, leds)
+        origin = last.inv().apply(lever.camera_body_m)
+        intersection_m = on_surface(last.inv().apply(rays), origin, leds)
         if np.isnan(intersection_m).any():
             raise ValueError("a ray misses the believed surface")
         # 2. Points in body axes
-        point = body_from_lab.apply(intersection_m)
+        point = last.apply(intersection_m)
         distance_m = np.linalg.norm(point - lever.camera_body_m, axis=1)
-        previous = body_from_lab
-        # 3. Attitude
-        body_from_lab = _wahba(point, distance_m, sigma_rad, position_m)
-        if (body_from_lab * previous.inv()).magnitude() < CONVERGED_RAD:
-            break
-    # The gradient of |(x - center) / semi_axes|^2 / 2 is along the surface's normal; n is it over its part along u.
-    normal = previous.apply((intersection_m - leds.center_m) / leds.semi_axes_m**2)
-    scaled_normal = normal / np.sum(normal * rays, axis=1, keepdims=True)
-    # p moves on the surface by distance (du - u n.du); rotating the surface by w moves p along u by n.(w x p).
-    across_normal = np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal)
-    by_ray_m = distance_m[:, None, None] * across_normal
-    by_rotation_m = np.cross(point, scaled_normal)
-    return _with_covariance(
-        body_from_lab, point, distance_m, sigma_rad, position_m, rays, by_ray_m, by_rotation_m
-    )
+        # The gradient of |(x - center) / semi_axes|^2 / 2 is along the surface's normal; n is it over its part along u.
+        normal = last.apply((intersection_m - leds.center_m) / leds.semi_axes_m**2)
+        scaled_normal = normal / np.sum(normal * rays, axis=1, keepdims=True)
+        # p moves on the surface by distance (du - u n.du); rotating the surface by w moves p along u by n.(w x p).
+        across_normal = np.eye(3) - np.einsum("ni,nj->nij", rays, scaled_normal)
+        by_ray_m = distance_m[:, None, None] * across_normal
+        return point, distance_m, by_ray_m, np.cross(point, scaled_normal)
+
+    # 3. Attitude
+    return _from_points(place, rays, sigma_rad, position_m, body_from_lab)
 
 
 def pnp(
@@ -337,17 +311,23 @@ def pnp(
     # 1. With the pattern's mean as origin, rotation and translation are nearly uncorrelated.
     centroid_m = position_m.mean(axis=0)
     pattern_m = position_m - centroid_m
-    start_shift_m = lever.cam_from_body.apply(
-        body_from_lab.apply(centroid_m) - lever.camera_body_m
-    )
+    start_rad = (lever.cam_from_body * body_from_lab).as_rotvec()[:, None]
+    start_m = lever.cam_from_body.apply(body_from_lab.apply(centroid_m) - lever.camera_body_m)
     # 2. Unweighted solution
-    cam_from_lab, shift_m = _opencv_pnp(
-        pattern_m, measured, lever.cam_from_body * body_from_lab, start_shift_m
-    )
+    start = start_rad, start_m[:, None]
+    try:
+        converged, rotvec, shift = cv2.solvePnP(
+            pattern_m, measured, np.eye(3), None, *start, True, cv2.SOLVEPNP_ITERATIVE
+        )
+    except cv2.error as error:
+        raise ValueError(f"pnp: OpenCV found no camera position: {error.err}") from None
+    if not converged:
+        raise ValueError("pnp: OpenCV found no camera position")
     # 3. Weighted solution: residuals are divided by their standard deviations.
     weight = np.repeat(1 / sigma_rad, 2)
+    cam_from_lab = Rotation.from_rotvec(np.ravel(rotvec))
     cam_from_lab, covariance_cam = _gauss_newton(
-        pattern_m, measured, cam_from_lab, shift_m, weight
+        pattern_m, measured, cam_from_lab, np.ravel(shift), weight
     )
     return lever.body_from_cam * cam_from_lab, in_body_axes(covariance_cam, lever)
 
@@ -400,22 +380,6 @@ def _six_dof_residual(
     q = b + shift_m
     jacobian = np.hstack([tangent_jacobian(b, q), tangent_gradients(q).reshape(-1, 3)])
     return (measured - q[:, :2] / q[:, 2:]).ravel() * weight, jacobian * weight[:, None]
-
-
-def _opencv_pnp(
-    pattern_m: Floats, tangent: Floats, cam_from_lab: Rotation, shift_m: Floats
-) -> tuple[Rotation, Floats]:
-    """Return cam_from_lab and the (3,) shift in camera axes by OpenCV's iterative PnP from an initial guess."""
-    start = cam_from_lab.as_rotvec()[:, None], np.array(shift_m)[:, None]
-    try:
-        converged, rotvec, shift = cv2.solvePnP(
-            pattern_m, tangent, np.eye(3), None, *start, True, cv2.SOLVEPNP_ITERATIVE
-        )
-    except cv2.error as error:
-        raise ValueError(f"pnp: OpenCV found no camera position: {error.err}") from None
-    if not converged:
-        raise ValueError("pnp: OpenCV found no camera position")
-    return Rotation.from_rotvec(np.ravel(rotvec)), np.ravel(shift)
 
 
 NearFieldSolver = Callable[..., tuple[Rotation, Floats]]

@@ -2,7 +2,7 @@
 
 Motion of images. A camera that rotates at the rate w, in its own axes, sees a place b from the bearing move as
 db/dt = -w x b. The ray is that of q = b - r, with r the lever arm; a star is infinitely far, b = q. The tangents
-(q_x / q_z, q_y / q_z) move by -J w, with J the Jacobian of `rotation_fit.tangent_jacobian` (`tangent_motion`).
+(q_x / q_z, q_y / q_z) move by -J w, with J the Jacobian of `systematic.geometry` (`tangent_motion`).
 
 Rolling shutter. Row y is exposed tau (y - y_mid) after the middle row. An image that moves at v px/s is found where it
 is at mid-exposure of the row in which it is found. This is exact for a constant v and an image that is symmetric about
@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import on_sphere
-from estimator.attitude.rotation_fit import tangent_jacobian
+from estimator.attitude.systematic import geometry
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats
 from estimator.core.errors import ImageError
@@ -79,7 +79,7 @@ def tangent_motion(rays_cam: Floats, sight: Sight = STARS) -> Floats:
     The errors raised are those of `places_cam`.
     """
     place = places_cam(rays_cam, sight)
-    return -tangent_jacobian(place, place - sight.lever_cam_m).reshape(-1, 2, 3)
+    return -geometry(place, place - sight.lever_cam_m).jacobian
 
 
 def center_streak_px(
@@ -192,10 +192,8 @@ def from_streaks(
     weighted = np.einsum("nij,nj,nk->ik", information, chord, chord)
     axis = np.linalg.eigh(weighted + weighted.T)[1][:, -1]
     # 3. One fit for each sign
-    rates = []
-    for sign in (1, -1):
-        signed = aligned(chord, np.eye(2)[None], sign * axis[None])
-        rates.append(_fit(camera, signed, information, motion, exposure_s))
+    signed = (aligned(chord, np.eye(2)[None], sign * axis[None]) for sign in (1, -1))
+    rates = [_fit(camera, one, information, motion, exposure_s) for one in signed]
     return [rate for rate in rates if rate is not None]
 
 

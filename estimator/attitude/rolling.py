@@ -21,7 +21,7 @@ from estimator.attitude.rate import (
     inverses,
     streak_factor,
 )
-from estimator.attitude.rotation_fit import tangent_jacobian
+from estimator.attitude.systematic import geometry
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats
 from estimator.core.types import Centroids, RateEstimate
@@ -122,8 +122,7 @@ def _rows(
 
     Those of the tangents are measured minus those of the (K, 3) rays predicted at the times of their rows.
     """
-    ray = place - lever_cam_m
-    jacobian = tangent_jacobian(place, ray).reshape(-1, 2, 3)
+    jacobian, _, tangent = geometry(place, place - lever_cam_m)
     delay_s = camera.row_delays_s(centroids.xy_px)
     # Covariance of the residuals: a centroid's error also shifts the time at which it is predicted.
     gain = error_gain(camera, -jacobian @ rate)
@@ -131,11 +130,21 @@ def _rows(
     # Slopes: J exp(-[w] t) by the rotation, -t J by the rate
     by_rotation = jacobian @ turn.as_matrix()
     by_rate = -delay_s[:, None, None] * jacobian
-    residual = camera.tangents(centroids.xy_px) - ray[:, :2] / ray[:, 2:]
+    residual = camera.tangents(centroids.xy_px) - tangent
     slopes = np.concatenate([by_rotation, by_rate], axis=2)
     rows = [_Rows(residual, slopes, inverses(error_rad2))]
     if exposure_s is not None and centroids.streak_px is not None:
-        rows.append(_streak_rows(camera, centroids, jacobian, rate, exposure_s))
+        # Measured minus predicted chords, the measured with the nearer sign
+        seen = np.isfinite(centroids.streak_px[:, 0])
+        chord, information = chords(camera, centroids.take(seen))
+        # A chord is -T J w times the rolling shutter's factor; the attitude does not change it to first order.
+        jacobian = jacobian[seen]
+        factor = streak_factor(camera, -jacobian @ rate)[:, None, None]
+        by_rate = -exposure_s * factor * jacobian
+        predicted = by_rate @ rate
+        residual = aligned(chord, information, predicted) - predicted
+        slopes = np.concatenate([0 * by_rate, by_rate], axis=2)
+        rows.append(_Rows(residual, slopes, information))
     return rows
 
 
@@ -160,21 +169,6 @@ def _solve(normal: Floats, gradient: Floats, lights: int) -> Floats:
     if not np.all(size > 0) or np.linalg.cond(normal / sizes) > 1e12:
         raise ValueError(f"{lights} lights do not determine attitude and rate")
     return np.linalg.solve(normal / sizes, gradient / size) / size
-
-
-def _streak_rows(
-    camera: Camera, centroids: Centroids, jacobian: Floats, rate: Floats, exposure_s: float
-) -> _Rows:
-    """Return the rows of the streaks: measured minus predicted chords, the measured with the nearer sign."""
-    assert centroids.streak_px is not None
-    seen = np.isfinite(centroids.streak_px[:, 0])
-    chord, information = chords(camera, centroids.take(seen))
-    jacobian = jacobian[seen]
-    # A chord is -T J w times the rolling shutter's factor; the attitude does not change it to first order.
-    by_rate = -exposure_s * streak_factor(camera, -jacobian @ rate)[:, None, None] * jacobian
-    predicted = by_rate @ rate
-    residual = aligned(chord, information, predicted) - predicted
-    return _Rows(residual, np.concatenate([0 * by_rate, by_rate], axis=2), information)
 
 
 def rate_covariance_rad2(

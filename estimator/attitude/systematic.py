@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimator.attitude.rotation_fit import tangent_gradients, tangent_jacobian
+from estimator.attitude.rotation_fit import tangent_gradients
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 
@@ -45,8 +45,9 @@ def geometry(place_cam: Floats, ray_cam: Floats) -> Geometry:
 
     For stars both are the same unit vectors.
     """
-    jacobian = tangent_jacobian(place_cam, ray_cam).reshape(-1, 2, 3)
-    return Geometry(jacobian, tangent_gradients(ray_cam), ray_cam[:, :2] / ray_cam[:, 2:])
+    gradient = tangent_gradients(ray_cam)
+    jacobian = np.cross(place_cam[:, None, :], gradient)  # d . (w x b) = w . (b x d)
+    return Geometry(jacobian, gradient, ray_cam[:, :2] / ray_cam[:, 2:])
 
 
 def with_focal(view: Geometry) -> Geometry:

@@ -242,7 +242,6 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
     ValueError
         If the lever or the lens is undetermined.
     """
-    covariances = None
     scale = 1.0
     try:
         # 1. Wrong identifications
@@ -260,25 +259,25 @@ def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
             covariances = covariance(subset.terms, fitted)
             if fit_noise:
                 check_redundancy(subset, covariances)
-            misfit = _misfit(subset, covariances)
+            chi2 = np.sum(ba.residuals(fitted, scaled) ** 2)
+            misfit = float(np.sqrt(chi2 / max(redundancy(subset, covariances), 1)))
             if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
                 break
             scale *= misfit
-        common = common_errors(subset.terms, subset.bundle)
+        common = common_errors(subset.terms, fitted)
+        # The lever to 10 % of the least LED distance, and the focal length to 10 %
+        sigma = np.sqrt(np.maximum(np.diag(covariances.shared), 0))
+        nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
+        determined = sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0]
+        determined = determined and np.isfinite(sigma).all()
     except LinAlgError:
         # A singular matrix raises the same ValueError as a nearly singular one
-        covariances = None
-    if covariances is None or not _determined(subset.bundle, covariances.shared):
+        determined = False
+    if not determined:
         raise ValueError(
             "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
         )
     return _Fit(subset, keep, status, covariances, misfit, scale, common)
-
-
-def _misfit(subset: Subset, covariances: Covariances) -> float:
-    """Return the square root of the pixels' chi-square over their redundancy."""
-    chi2 = np.sum(ba.residuals(subset.bundle, subset.sightings) ** 2)
-    return float(np.sqrt(chi2 / max(redundancy(subset, covariances), 1)))
 
 
 def redundancy(subset: Subset, covariances: Covariances) -> float:
@@ -347,7 +346,7 @@ def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, n
     """
     # a. Attitudes
     keep = np.ones(len(sightings.led), dtype=bool)
-    subset = connected_subset(full, sightings, keep)
+    subset = connected_subset(full, sightings)
     fitted = ba.fit_attitudes(subset.bundle, subset.sightings, 12)
     full = subset.insert_into(full, fitted)
     # b. Gross outliers
@@ -369,17 +368,6 @@ def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
     """Return (M,) whether each residual is below `gate` robust sigmas."""
     length = np.linalg.norm(ba.residuals(bundle, sightings), axis=1)
     return length < gate * ba.robust_scale(bundle, sightings)
-
-
-def _determined(fitted: Bundle, shared: Floats) -> bool:
-    """Return whether the lever is determined to 10 % of the least LED distance, and the focal length to 10 %."""
-    sigma = np.sqrt(np.maximum(np.diag(shared), 0))
-    nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
-    return bool(
-        np.isfinite(sigma).all()
-        and sigma[:3].max() < 0.1 * nearest_m
-        and sigma[3] < 0.1 * fitted.lens[0]
-    )
 
 
 def _report(

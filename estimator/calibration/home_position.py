@@ -21,7 +21,7 @@ from estimator.attitude.nearfield import thesis_points
 from estimator.calibration.bundle_adjustment import summed
 from estimator.core import checks
 from estimator.core.camera import Camera
-from estimator.core.checks import Bools, Floats, Ints, frozen
+from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
 
@@ -176,35 +176,31 @@ def calibrate(
     # 1. Positions in the lab
     id_, samples = _lab_positions(sightings, camera, surface, lever)
     # 2. Repeatability
-    coordinates = [pooled(column, samples.led) for column in samples.lab_m.T]
+    covariance_m2 = _covariance(samples.lab_m, samples.led)
     epsilons = (
         _maximum(pooled(samples.brightness, samples.led), "light"),
-        _maximum(np.concatenate(coordinates), "light"),
+        _maximum(np.sqrt(np.einsum("nii->ni", covariance_m2)), "light"),
         _maximum(pooled(*_separations(samples)), "pair of lights"),
     )
-    # 3. Catalog
+    # 3. Catalog of the lights at home, brightest first
     at_home = samples.stop == sightings[0].stop
-    order, mean_m, brightness, count = _brightest_first(samples, at_home)
-    covariance = _covariance(samples.lab_m, samples.led)[order]
-    return HomeCatalog(
-        id_[order], normalized(mean_m), brightness, mean_m, covariance, count, *epsilons
-    )
-
-
-def _brightest_first(samples: _Samples, selected: Bools) -> tuple[Ints, Floats, Floats, Ints]:
-    """Return the lights of the selected samples, brightest first.
-
-    They are given as rows of their ids, mean positions (N, 3), mean brightness, and numbers of frames.
-    """
-    led = samples.led[selected]
+    led = samples.led[at_home]
     count = np.bincount(led)
-    columns = (*samples.lab_m[selected].T, samples.brightness[selected])
+    columns = (*samples.lab_m[at_home].T, samples.brightness[at_home])
     total = [np.bincount(led, column) for column in columns]
     mean = np.column_stack(total) / np.maximum(count, 1)[:, None]
     # Lights that are not among the samples have a count of 0.
     order = np.argsort(-mean[:, 3], kind="stable")
     order = order[count[order] > 0]
-    return order, mean[order, :3], mean[order, 3], count[order]
+    return HomeCatalog(
+        id_[order],
+        normalized(mean[order, :3]),
+        mean[order, 3],
+        mean[order, :3],
+        covariance_m2[order],
+        count[order],
+        *epsilons,
+    )
 
 
 def _lab_positions(
@@ -214,7 +210,20 @@ def _lab_positions(
     if not len(sightings):
         raise ImageError("no sightings; allowed: at least two frames")
     for index, sighting in enumerate(sightings):
-        _check(index, sighting)
+        count = len(sighting.led)
+        if (
+            not count
+            or sighting.xy_px.shape != (count, 2)
+            or sighting.brightness.shape != (count,)
+        ):
+            raise ImageError(
+                f"sighting {index}: {count} ids, centroids {sighting.xy_px.shape}, brightness "
+                f"{sighting.brightness.shape}; allowed: K ids, (K, 2) and (K,), K from 1"
+            )
+        if len(np.unique(sighting.led)) < count:
+            raise ImageError(f"sighting {index}: an id occurs twice; allowed: each id once")
+        if not (np.isfinite(sighting.xy_px).all() and np.isfinite(sighting.brightness).all()):
+            raise ImageError(f"sighting {index}: a centroid or a brightness is not finite")
     lights = [len(sighting.led) for sighting in sightings]
     frame = np.repeat(np.arange(len(sightings)), lights)
     stop = np.repeat([sighting.stop for sighting in sightings], lights)
@@ -229,38 +238,13 @@ def _lab_positions(
     return id_, _Samples(led, frame, stop, body_m, lab_m, brightness)
 
 
-def _check(index: int, sighting: Sighting) -> None:
-    """Raise ImageError unless a sighting's arrays have matching shapes and finite values, and its ids differ."""
-    lights = len(sighting.led)
-    if (
-        not lights
-        or sighting.xy_px.shape != (lights, 2)
-        or sighting.brightness.shape != (lights,)
-    ):
-        raise ImageError(
-            f"sighting {index}: {lights} ids, centroids {sighting.xy_px.shape}, brightness "
-            f"{sighting.brightness.shape}; allowed: K ids, (K, 2) and (K,), K from 1"
-        )
-    if len(np.unique(sighting.led)) < lights:
-        raise ImageError(f"sighting {index}: an id occurs twice; allowed: each id once")
-    if not (np.isfinite(sighting.xy_px).all() and np.isfinite(sighting.brightness).all()):
-        raise ImageError(f"sighting {index}: a centroid or a brightness is not finite")
-
-
 def _separations(samples: _Samples) -> tuple[Floats, Ints]:
     """Return the angle about the bearing of every pair in every frame (eq. 45), and its pair's number."""
     # All pairs of each frame
     direction = normalized(samples.body_m)
-    first = []
-    second = []
-    for rows in np.split(
-        np.arange(len(samples.led)), np.flatnonzero(np.diff(samples.frame)) + 1
-    ):
-        i, j = np.triu_indices(len(rows), 1)
-        first.append(rows[i])
-        second.append(rows[j])
-    a = np.concatenate(first)
-    b = np.concatenate(second)
+    first = np.flatnonzero(np.diff(samples.frame)) + 1
+    frames = np.split(np.arange(len(samples.led)), first)
+    a, b = np.hstack([rows[np.array(np.triu_indices(len(rows), 1))] for rows in frames])
     if not len(a):
         raise ImageError(
             "no frame has two lights; allowed: two or more in a frame, for their separation"

@@ -49,6 +49,7 @@ from estimator.calibration.mass_dynamics import (
 from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.vectors import normalized
+from estimator.filter.correct import root
 from estimator.filter.error_models import TrackerModel
 
 MAX_ITERATIONS = 30
@@ -178,8 +179,8 @@ def considered(
         fitted = part.states_by_parameter.reshape(-1, STATE, size)[:, :3]
         gain = covariance @ (by_bias - fitted).mT @ np.linalg.inv(record.varying_rad2)
         # 2. K_n L_n
-        varying.append(gain @ symmetric_root(record.varying_rad2 - record.noise_rad2))
-        constant.append(gain @ symmetric_root(record.covariance_rad2 - record.varying_rad2))
+        varying.append(gain @ root(record.varying_rad2 - record.noise_rad2))
+        constant.append(gain @ root(record.covariance_rad2 - record.varying_rad2))
         attitudes.append(record.lab_from_body)
         if record.lights is not None:
             lights.append(record.lights)
@@ -199,12 +200,6 @@ def considered(
     total = np.concatenate(constant).sum(axis=0)
     added = np.einsum("mpk,mn,nqk->pq", effect, shared, effect, optimize=True)
     return added + total @ total.T
-
-
-def symmetric_root(matrix: Floats) -> Floats:
-    """Return the (N, 3, 3) symmetric roots of positive semi-definite matrices."""
-    values, axes = np.linalg.eigh(matrix)
-    return axes * np.sqrt(np.maximum(values, 0))[:, None] @ axes.mT
 
 
 def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
@@ -352,6 +347,9 @@ def lower_band(diagonal: Floats, beside: Floats) -> Floats:
 # Mass properties in flight: an extended Kalman filter of state and parameters, one attitude after another.
 
 START = 20  # number of attitudes of the batch that begins the filter
+AT_BIAS = slice(
+    STATE + BIAS.start, STATE + BIAS.stop
+)  # rows of the bias after those of the state
 RATE_SIGMA_RAD_S = 0.01  # standard deviation of the rate from the attitudes before and after
 
 
@@ -417,7 +415,6 @@ def filter_from(
     # 2. State at the second attitude
     states = first_states(record, lab, values).take(slice(1, 2))
     covariance = first_covariance(begun, record, lab)
-    at_bias = slice(STATE + BIAS.start, STATE + BIAS.stop)
     chi2 = 0.0
     for n in range(2, len(record.t_s)):
         # 3. Integration: P <- F P F^T + Q
@@ -428,8 +425,8 @@ def filter_from(
         covariance[:STATE, :STATE] += link.noise[0]
         # 4. Correction, with P H^T in `seen`
         off = measured_minus(record.lab_from_body[n], link.after.rotation, values[BIAS])[0]
-        seen = covariance[:3] + covariance[at_bias]
-        innovation = seen[:, :3] + seen[:, at_bias] + record.covariance_rad2[n]
+        seen = covariance[:3] + covariance[AT_BIAS]
+        innovation = seen[:, :3] + seen[:, AT_BIAS] + record.covariance_rad2[n]
         gain = np.linalg.solve(innovation, seen).T
         chi2 += float(off @ np.linalg.solve(innovation, off))
         change = gain @ off
@@ -468,5 +465,5 @@ def joseph(covariance: Floats, gain: Floats, noise: Floats) -> Floats:
     """Return the covariance after an attitude, (I - K H) P (I - K H)^T + K S K^T, which stays positive."""
     kept = np.eye(len(covariance))
     kept[:, :3] -= gain
-    kept[:, STATE + BIAS.start : STATE + BIAS.stop] -= gain
+    kept[:, AT_BIAS] -= gain
     return kept @ covariance @ kept.T + gain @ noise @ gain.T

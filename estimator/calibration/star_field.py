@@ -410,6 +410,18 @@ def _report(
     covariance = survey_subset.covariance(terms, replace(bundle, R_body_from_lab=R[:0]))
     attitude_covariance = covariance.by_led
     attitude_covariance[~tied] = np.nan
+    # Magnitude zero point from the stars that were kept, if every frame has flux and magnitude
+    flux = [frame.flux for frame in frames if frame.flux is not None]
+    v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
+    zero = None
+    if len(flux) == len(v_mag) == len(frames):
+        exposure_s = np.concatenate(
+            [np.full(len(frame.xy_px), frame.exposure_s) for frame in frames]
+        )
+        instrumental = -2.5 * np.log10(np.concatenate(flux) / exposure_s)
+        zero = magnitude_zero(
+            instrumental[keep], np.concatenate(v_mag)[keep], bundle.position_m[keep]
+        )
     # Residuals
     residual = ba.residuals(bundle, sightings)
     residual_px = residual * sightings.sigma_px[:, None]
@@ -424,24 +436,9 @@ def _report(
         len(sightings.frame),
         rms_px=float(np.sqrt(np.mean(residual_px**2))),
         misfit=float(np.sqrt(np.sum(residual**2) / max(freedom, 1))),
-        magnitude=_magnitude(frames, keep, bundle.position_m[keep]),
+        magnitude=zero,
     )
     return Calibration(camera.with_lens(bundle.lens), covariance.shared, report)
-
-
-def _magnitude(
-    frames: Sequence[StarFrame], keep: np.ndarray, vectors_ref: Floats
-) -> MagnitudeZero | None:
-    """Return the magnitude zero point from the stars that were kept; None unless every frame has flux and magnitude."""
-    flux = [frame.flux for frame in frames if frame.flux is not None]
-    v_mag = [frame.v_mag for frame in frames if frame.v_mag is not None]
-    if not len(flux) == len(v_mag) == len(frames):
-        return None
-    exposure_s = np.concatenate(
-        [np.full(len(frame.xy_px), frame.exposure_s) for frame in frames]
-    )
-    instrumental = -2.5 * np.log10(np.concatenate(flux) / exposure_s)
-    return magnitude_zero(instrumental[keep], np.concatenate(v_mag)[keep], vectors_ref)
 
 
 def _identified(

@@ -354,8 +354,11 @@ def exchanged(table: LightTable) -> tuple[list[Exchange], float | None]:
     # 2. Suspects
     least = np.log(max(count, 2) ** 2 / 2 / FALSE_ALARMS) / 2
     suspects = np.flatnonzero(likelihood.max(axis=1, initial=-np.inf) - own > least)
-    tested = np.isfinite(table.light).sum(axis=0) >= MIN_FRAMES
-    observable = _observable(likelihood, tested, least)
+    # An exchange would be found if each of the two LEDs explains the other's light worse.
+    tested = np.flatnonzero(np.isfinite(table.light).sum(axis=0) >= MIN_FRAMES)
+    worse = own[tested, None] - likelihood[np.ix_(tested, tested)] > least
+    pairs = len(tested) * (len(tested) - 1)
+    observable = float(np.sum(worse & worse.T) / pairs) if pairs else None
     if len(suspects) < 2:
         return [], observable
     # 3. Permutation
@@ -472,17 +475,3 @@ def _log_likelihood(table: LightTable) -> Floats:
     out = wrong * np.log(CHANCE) - chi2 / 2
     out[~tested] = 0.0
     return out
-
-
-def _observable(likelihood: Floats, tested: Bools, least: float) -> float | None:
-    """Return the share of the pairs of tested LEDs whose exchange would be found; None with fewer than two LEDs.
-
-    An exchange would be found if each of the two LEDs explains the other's light worse by `least`.
-    """
-    rows = np.flatnonzero(tested)
-    if len(rows) < 2:
-        return None
-    own = np.diag(likelihood)[rows]
-    worse = own[:, None] - likelihood[np.ix_(rows, rows)] > least
-    pairs = len(rows) * (len(rows) - 1)
-    return float(np.sum(worse & worse.T) / pairs)

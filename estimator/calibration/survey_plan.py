@@ -298,16 +298,6 @@ class _Reach:
         These are MIN_SHARED, or as many as any useful candidate shares. Only LEDs with crossing rays count. If no
         useful candidate has LEAST_CROSSING of them, all shared ones count.
         """
-        crossing, shared = self.shared()
-        # At the start every LED counts.
-        if not self.count.any():
-            shared = self.counted(np.ones(len(self.row), dtype=bool))
-        if crossing[useful].max(initial=0) >= LEAST_CROSSING:
-            shared = crossing
-        return shared >= min(MIN_SHARED, shared[useful].max(initial=0))
-
-    def shared(self) -> tuple[Ints, Ints]:
-        """Return the (C,) numbers of each candidate's LEDs seen before: from another direction, and from any."""
         # Sums with the candidate's own position
         led = self.led
         count = self.count[self.led] + 1
@@ -317,8 +307,12 @@ class _Reach:
         across_m2 = self.arm_m @ self.arm_m - np.sum(mean_m**2, axis=1)
         across_m2 -= (self.along_m2[led] + self.along_m**2) / count - mean_along_m**2
         least_m = PLANNED_RAD * (self.distance_m[led] - mean_along_m)
-        is_crossing = (count > 1) & (across_m2 > least_m**2)
-        return self.counted(is_crossing), self.counted(count > 1)
+        # Each candidate's LEDs seen before: from another direction, and from any. At the start every LED counts.
+        crossing = self.counted((count > 1) & (across_m2 > least_m**2))
+        shared = self.counted((count > 1) | ~self.count.any())
+        if crossing[useful].max(initial=0) >= LEAST_CROSSING:
+            shared = crossing
+        return shared >= min(MIN_SHARED, shared[useful].max(initial=0))
 
     def counted(self, sightings: Bools) -> Ints:
         """Return the (C,) numbers of the selected sightings of each candidate."""

@@ -109,24 +109,24 @@ class StarCatalog:
             For arrays of other lengths, places out of range, and values that look like radians.
         """
         count = checks.native("catalog: v_mag", v_mag, np.float64).size
-        ra, dec, magnitude = (
-            _column(name, value, count, False)
-            for name, value in (("ra_deg", ra_deg), ("dec_deg", dec_deg), ("v_mag", v_mag))
-        )
-        motion = {
-            "pm_ra_mas_yr": pm_ra_mas_yr,
-            "pm_dec_mas_yr": pm_dec_mas_yr,
-            "parallax_mas": parallax_mas,
-        }
-        pm_ra, pm_dec, parallax = (
-            _column(name, value, count, True) for name, value in motion.items()
+        given = ra_deg, dec_deg, pm_ra_mas_yr, pm_dec_mas_yr, parallax_mas, v_mag
+        # One motion or parallax, in mas, may be that of all stars.
+        ra, dec, *others = (
+            _column(name, value, count, "_mas" in name)
+            for name, value in zip(COLUMNS[1:], given, strict=True)
         )
         epoch_yr = checks.number(
             "catalog: epoch_yr", epoch_yr, *EPOCHS_YR, "a Julian year of 1800 to 2200"
         )
         _check_places(ra, dec)
-        columns = _identifiers(id, count), ra, dec, pm_ra, pm_dec, parallax, magnitude
-        return from_columns(*columns, epoch_yr=epoch_yr).brightest_first()
+        numbers = np.arange(1, count + 1)
+        if id is not None:
+            numbers = checks.row_numbers("catalog: id", id, 2**63 - 1)
+        if len(numbers) != count:
+            raise ImageError(
+                f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
+            )
+        return from_columns(numbers, ra, dec, *others, epoch_yr=epoch_yr).brightest_first()
 
     def take(self, which: NDArray) -> StarCatalog:
         """Select stars by mask or index."""
@@ -166,18 +166,6 @@ def _column(name: str, value: ArrayLike, count: int, one_for_all: bool) -> Float
             f"catalog: {name} has a NaN or infinity in row {checks.first_bad(np.isfinite(array))}"
         )
     return array
-
-
-def _identifiers(id: ArrayLike | None, count: int) -> Ints:
-    """(count,) identifiers; 1 to count if none are given. Raises ImageError for another number of them."""
-    if id is None:
-        return np.arange(1, count + 1)
-    numbers = checks.row_numbers("catalog: id", id, 2**63 - 1)
-    if len(numbers) != count:
-        raise ImageError(
-            f"catalog: id has {len(numbers)} numbers; allowed: {count}, one a star"
-        )
-    return numbers
 
 
 def _check_places(ra_deg: Floats, dec_deg: Floats) -> None:
@@ -357,7 +345,14 @@ def columns(
     """
     try:
         lines = file_bytes(path).decode().splitlines()
-        epoch_yr = _epoch_yr(lines)
+        # The header's line `# epoch_jyear: 1991.25`
+        matches = (re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line) for line in lines)
+        found = next(filter(None, matches), None)
+        epoch_yr = float(found[1]) if found else np.nan
+        if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
+            raise ValueError(
+                "its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR)
+            )
         body = [line for line in lines if line and not line.startswith("#")]
         delimiter = "," if "," in body[0] else None
         header = body[0].replace('"', "").split(delimiter)
@@ -383,16 +378,6 @@ def columns(
             f"{path}: not a star catalog ({reason(error)}); allowed: ECSV with {', '.join((*names, *optional))}"
         ) from None
     return table.T, epoch_yr
-
-
-def _epoch_yr(lines: Sequence[str]) -> float:
-    """The Julian year in the header's line `# epoch_jyear: 1991.25`. Raises ValueError if there is none."""
-    matches = (re.fullmatch(r"#\s*epoch_jyear:\s*(\d+\.?\d*)\s*", line) for line in lines)
-    found = next(filter(None, matches), None)
-    epoch_yr = float(found[1]) if found else np.nan
-    if not EPOCHS_YR[0] <= epoch_yr <= EPOCHS_YR[1]:
-        raise ValueError("its header has no epoch_jyear of {:g} to {:g}".format(*EPOCHS_YR))
-    return epoch_yr
 
 
 def _number_or_nan(text: str) -> float:

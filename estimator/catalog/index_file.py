@@ -46,7 +46,15 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
         return read(path)
     built = quad_index.build(sky, height_rad)
     with suppress(OSError, ValueError):
-        _write(path, built)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        data = b"".join(array.tobytes() for array in (built.first, built.star, built.code))
+        with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
+            file.write(data + np.uint32(zlib.crc32(data)).tobytes())
+        os.replace(file.name, path)
+        # The oldest files are removed.
+        files = sorted(path.parent.glob("quads_*.bin"), key=os.path.getmtime)
+        for old in files[:-MOST_FILES]:
+            old.unlink()
         return read(path)
     return built
 
@@ -59,15 +67,3 @@ def read(path: Path) -> QuadIndex:
         raise ValueError(f"{path}: damaged")
     star, code = words[HEAD:-1].reshape(2, -1, 4)
     return QuadIndex(star, code.view(np.float32), words[:HEAD])
-
-
-def _write(path: Path, quads: QuadIndex) -> None:
-    """Write a file, and remove the oldest ones."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    data = b"".join(array.tobytes() for array in (quads.first, quads.star, quads.code))
-    with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-        file.write(data + np.uint32(zlib.crc32(data)).tobytes())
-    os.replace(file.name, path)
-    files = sorted(path.parent.glob("quads_*.bin"), key=os.path.getmtime)
-    for old in files[:-MOST_FILES]:
-        old.unlink()

@@ -347,8 +347,15 @@ def _fit_streaks(
     some = np.arange(min(VOTING_BLOBS, len(blobs)))
     for _ in range(0 if priors.streak_px else STREAK_ROUNDS):
         rows = _fit_around(image, blobs, blobs.xy_px, expected_px, some, gain_e_dn, priors)
+        measured = some[np.isfinite(rows[some, 8])]
+        if len(measured) < MIN_STREAKS:
+            break
         # The streaks without their priors, as those depend on the expected streak.
-        shift_px = _median_shift(rows[some, 8:10], expected_px[some])
+        vectors = rows[measured, 8:10]
+        expected = expected_px[measured]
+        # A streak and its reverse are equal: give each the sign of the expected one.
+        sign = np.where(np.sum(vectors * expected, axis=1) < 0, -1.0, 1.0)
+        shift_px = np.median(sign[:, None] * vectors - expected, axis=0)
         length_px = float(np.median(np.hypot(*expected_px.T)))
         if np.hypot(*shift_px) < streak_fit.length_sigma_px(length_px) / 4:
             break
@@ -382,18 +389,6 @@ def _fit_around(
         priors.saturation,
         tightness,
     )
-
-
-def _median_shift(vectors_px: Floats, expected_px: Floats) -> Floats:
-    """Return the (2,) median of measured less expected streaks (N, 2), with equal signs; 0 with too few."""
-    measured = np.isfinite(vectors_px[:, 0])
-    if np.count_nonzero(measured) < MIN_STREAKS:
-        return np.zeros(2)
-    vectors = vectors_px[measured]
-    expected = expected_px[measured]
-    # A streak and its reverse are equal: give each the sign of the expected one.
-    sign = np.where(np.sum(vectors * expected, axis=1) < 0, -1.0, 1.0)
-    return np.median(sign[:, None] * vectors - expected, axis=0)
 
 
 def _frame_streaks(image: NDArray, blobs: Blobs, priors: FramePriors) -> Floats:

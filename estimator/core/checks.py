@@ -137,7 +137,9 @@ def floats(what: str, value: object, shape: tuple[int | None, ...]) -> Floats:
     if array.ndim != len(shape) or any(
         want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
     ):
-        raise ImageError(f"{what} has shape {array.shape}; allowed: {_shape_text(shape)}")
+        words = ["N" if length is None else str(length) for length in shape]
+        allowed = f"({', '.join(words)}{',' * (len(words) == 1)})"
+        raise ImageError(f"{what} has shape {array.shape}; allowed: {allowed}")
     return array
 
 
@@ -203,9 +205,3 @@ def excerpt(value: object) -> str:
     """Return a value's text in one line of at most 60 characters."""
     text = " ".join((str(value) if isinstance(value, Exception) else repr(value)).split())
     return text if len(text) <= 60 else f"{text[:59]}…"
-
-
-def _shape_text(shape: tuple[int | None, ...]) -> str:
-    """Return the text of a shape, with N for any length."""
-    words = ["N" if length is None else str(length) for length in shape]
-    return f"({', '.join(words)}{',' * (len(words) == 1)})"

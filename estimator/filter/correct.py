@@ -190,11 +190,11 @@ def right_jacobian(rotation_rad: Floats) -> Floats:
 
 
 def root(covariance: Floats) -> Floats:
-    """Return the symmetric root L of a (3, 3) covariance.
+    """Return the (..., 3, 3) symmetric roots L of covariances.
 
     The symmetric root is continuous in the covariance, so the slow error of successive solutions is too.
     """
     if not covariance.any():
-        return np.zeros((3, 3))
+        return np.zeros_like(covariance)
     variances, axes = np.linalg.eigh(covariance)
-    return (axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T
+    return axes * np.sqrt(np.maximum(variances, 0.0))[..., None, :] @ axes.mT

@@ -226,7 +226,7 @@ class AttitudeFilter:
             "systematic": 1.0,
         }
         self._initial_bias_variance = sigma_bias**2
-        self._current = start_state(float(t_s), wxyz_of(body_from_ref), sigmas, self._layout)
+        self._current = start_state(t_s, wxyz_of(body_from_ref), sigmas, self._layout)
         self._segments = [_Segment(self._current, np.empty((0, 5)), None)]
         # Consecutive refused solutions, each of which agrees with the one before, and the states before them.
         self._refused: list[tuple[MekfState, AttitudeFix]] = []
@@ -306,7 +306,16 @@ class AttitudeFilter:
         # The samples belong to the history since the last solution.
         last = self._segments[-1]
         self._segments[-1] = last._replace(samples=np.concatenate([last.samples, samples]))
-        self._trim_history(float(samples[-1, 0]) - HISTORY_S)
+        # Older history is deleted: whole segments, and the first half of the samples of a long one.
+        before_s = float(samples[-1, 0]) - HISTORY_S
+        while len(self._segments) > 1 and self._segments[1].state.t_s < before_s:
+            del self._segments[0]
+        # Half at a time, so that the cost of propagating the first state is spread over many calls.
+        first = self._segments[0]
+        if len(first.samples) and first.samples[0, 0] < before_s:
+            half = len(first.samples) // 2
+            state = self._propagate_state(first.state, first.samples[:half])
+            self._segments[0] = _Segment(state, first.samples[half:], None)
 
     def update(
         self,
@@ -447,17 +456,6 @@ class AttitudeFilter:
             prior = self._prior(earlier.state, earlier.samples)
             found = innovation(prior, segment.solution, self._layout)
             self._segments[j] = segment._replace(state=correct(prior, found, self._layout))
-
-    def _trim_history(self, before_s: float) -> None:
-        """Delete history before a time: whole segments, and the first half of the samples of a long one."""
-        while len(self._segments) > 1 and self._segments[1].state.t_s < before_s:
-            del self._segments[0]
-        # Half at a time, so that the cost of propagating the first state is spread over many calls.
-        first = self._segments[0]
-        if len(first.samples) and first.samples[0, 0] < before_s:
-            half = len(first.samples) // 2
-            state = self._propagate_state(first.state, first.samples[:half])
-            self._segments[0] = _Segment(state, first.samples[half:], None)
 
     def _propagate_state(self, state: MekfState, samples: Floats) -> MekfState:
         """Return the state after gyro samples, by the filter's own models."""

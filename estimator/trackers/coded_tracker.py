@@ -127,8 +127,8 @@ class CodedTracker(DomeTracker):
             code.bits if goes_dark else MISSED_FRAMES,
             goes_dark,
         )
-        self.templates = np.zeros((len(code.phases), len(code.levels), self.tracks.frames))
-        self.spread = np.zeros_like(self.templates)
+        # Expected levels and their errors, by phase, LED and frame
+        self.templates = np.zeros((2, len(code.phases), len(code.levels), self.tracks.frames))
         # Phases of the code's clock that the lights have not excluded
         self.phases = np.ones(len(code.phases), bool)
         self.last_s: float | None = None
@@ -161,11 +161,9 @@ class CodedTracker(DomeTracker):
         self._advance(centroids, t_s, rate)
         # Expected brightness of all LEDs in this frame
         middle_s = t_s or 0.0
-        templates, spread = self.code.templates(
+        self.templates[..., self.tracks.column] = self.code.templates(
             frame, middle_s - exposure_s / 2, middle_s + exposure_s / 2
         )
-        self.templates[:, :, self.tracks.column] = templates
-        self.spread[:, :, self.tracks.column] = spread
         if not len(centroids):
             return Attitude(NO_LIGHTS)
         # 3. to 5. Names and attitude
@@ -231,9 +229,7 @@ class CodedTracker(DomeTracker):
         """
         tried = np.flatnonzero(self.phases)
         leds = len(self.code.levels)
-        templates, spread = (
-            one[tried].reshape(len(tried) * leds, -1) for one in (self.templates, self.spread)
-        )
+        templates, spread = self.templates[:, tried].reshape(2, len(tried) * leds, -1)
         flat = np.full((len(light), len(templates)), np.inf)
         for one, row, error in zip(flat, light, sigma, strict=True):
             likely = led_codes.likely(row, templates) if len(tried) > 1 else np.arange(leds)

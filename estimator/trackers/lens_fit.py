@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from estimator.attitude.rotation_fit import tangent_jacobian
+from estimator.attitude.systematic import geometry
 from estimator.core.camera import Camera, distorted, distortion_slopes
 from estimator.core.checks import Floats, frozen
 from estimator.core.least_squares import variance_factor
@@ -134,7 +134,7 @@ class FittedCamera:
         camera = self.camera
         focal_px = camera.focal_px
         seen = self.cam_from_ref.apply(vectors_ref)
-        tangent = seen[:, :2] / seen[:, 2:]
+        jacobian, _, tangent = geometry(seen, seen)
         shear, twist = self.change[[SHEAR, TWIST]]
         stretch = focal_px * np.array([[1.0, shear], [shear, camera.aspect]])
         bent = distorted(tangent, camera.distortion)
@@ -142,7 +142,6 @@ class FittedCamera:
         by_twist = focal_px * bent[:, 1:] * bent[:, ::-1] * [-1.0, 1.0]
         offset = bent @ stretch + twist * by_twist
         slopes = np.zeros((len(seen), 2, UNKNOWNS))
-        jacobian = tangent_jacobian(seen, seen).reshape(-1, 2, 3)
         slopes[:, :, :FOCAL] = stretch @ by_tangent @ jacobian
         slopes[:, :, FOCAL] = offset
         slopes[:, 1, ASPECT] = focal_px * camera.aspect * bent[:, 1]

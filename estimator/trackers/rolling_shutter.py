@@ -29,10 +29,10 @@ from estimator.attitude.rate import (
     from_moments,
     from_streaks,
 )
-from estimator.attitude.rotation_fit import tangent_jacobian
+from estimator.attitude.systematic import geometry
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
-from estimator.core.types import Attitude, Centroids, RateEstimate
+from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import NO_LIGHTS, NO_STARS
 
@@ -103,13 +103,12 @@ def solve_lights(
         return with_streak_rate(solve_global(centroids), centroids, exposure_s, rate, lights)
     best: Attitude | None = None
     # 1. Candidates of the rate
-    for candidate, prior in candidates(camera, lights.sight, centroids, rate, exposure_s):
+    for start in candidates(camera, lights.sight, centroids, rate, exposure_s):
         # 2. to 4. Solution with a candidate
-        start = (candidate, prior)
         attitude = _solve_with(camera, lights, centroids, solve_global, start, exposure_s)
         if attitude.solved and (best is None or attitude.log10_chance < best.log10_chance):
             best = attitude
-        if best is not None and candidate.sign_known:
+        if best is not None and start[0].sign_known:
             break
     return best or attitude
 
@@ -124,32 +123,44 @@ def _solve_with(
 ) -> Attitude:
     """Return attitude and rate from one candidate of the rate with its prior: steps 2 to 4 of the module."""
     # 2. Identification
-    candidate = start[0]
-    attitude = solve_global(at_middle_row(camera, centroids, candidate, lights.sight))
-    fitted = candidate
+    fitted = start[0]
+    attitude = solve_global(at_middle_row(camera, centroids, fitted, lights.sight))
     matched = np.empty((2, 0), int)
     for _ in range(ROUNDS):
         # 3. Fit, until the matches stay the same
-        if attitude.match is None:
+        match = attitude.match
+        if match is None:
             break
-        rows = np.stack([attitude.match.observed, attitude.match.star])
+        rows = np.stack([match.observed, match.star])
         if np.array_equal(rows, matched):
             break
         matched = rows
         try:
-            fitted = _fit(camera, lights, centroids, attitude, start, exposure_s)
+            seen = lights.with_errors(centroids.take(match.observed), match.star)
+            lens = _lens(attitude, camera)
+            fitted = _fit(lens, lights, seen, match, start, exposure_s)
         except ValueError as error:
             return Attitude(f"no attitude: {error}")
         # The rate's error is common to all lights, and is added in step 4.
         exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
-        sight = _sight_of(lights, attitude, centroids)
+        # Identified lights are at their own distance, others at the median one.
+        radius_m = np.full(len(centroids), lights.sight.radius_m)
+        radius_m[match.observed] = np.linalg.norm(lights.place_ref[match.star], axis=1)
+        sight = Sight(lights.lever_cam_m, radius_m)
         attitude = solve_global(at_middle_row(camera, centroids, exact, sight))
     # 4. Error of the rate
-    return (
-        _with_rate(camera, lights, centroids, attitude, fitted)
-        if attitude.solved
-        else attitude
+    match = attitude.match
+    if match is None or attitude.covariance_rad2 is None:
+        return attitude
+    seen = lights.with_errors(centroids.take(match.observed), match.star)
+    place = match.cam_from_ref.apply(lights.place_ref[match.star])
+    by_rate = rolling.rate_covariance_rad2(
+        _lens(attitude, camera),
+        seen,
+        geometry(place, place - lights.lever_cam_m).jacobian,
+        fitted.covariance_rad2_s2,
     )
+    return replace(attitude, covariance_rad2=attitude.covariance_rad2 + by_rate, rate=fitted)
 
 
 def candidates(
@@ -196,10 +207,10 @@ def candidates(
 
 
 def _fit(
-    camera: Camera,
+    lens: Camera,
     lights: Lights,
-    centroids: Centroids,
-    attitude: Attitude,
+    seen: Centroids,
+    match: StarMatch,
     start: tuple[RateEstimate, RateEstimate],
     exposure_s: float | None,
 ) -> RateEstimate:
@@ -210,14 +221,12 @@ def _fit(
 
     Parameters
     ----------
+    seen
+        Centroids of the matches
     start
         Candidate of the rate, and its prior
     """
-    match = attitude.match
-    lens = _lens(attitude, camera)
     candidate, prior = start
-    assert match is not None
-    seen = lights.with_errors(centroids.take(match.observed), match.star)
     places = lights.place_ref[match.star]
     # Rows alone
     first = match.cam_from_ref, candidate.rate_rad_s
@@ -250,36 +259,6 @@ def _lens(attitude: Attitude, camera: Camera) -> Camera:
 def _radii(lights: Lights, places: Floats) -> Sight:
     """Return the sight of identified lights: each at its own distance from the bearing, which no attitude changes."""
     return Sight(lights.lever_cam_m, np.linalg.norm(places, axis=1))
-
-
-def _sight_of(lights: Lights, attitude: Attitude, centroids: Centroids) -> Sight:
-    """Return the sight of all centroids: identified ones at their own distance, others at the median one."""
-    match = attitude.match
-    assert match is not None
-    radius_m = np.full(len(centroids), lights.sight.radius_m)
-    radius_m[match.observed] = np.linalg.norm(lights.place_ref[match.star], axis=1)
-    return Sight(lights.lever_cam_m, radius_m)
-
-
-def _with_rate(
-    camera: Camera,
-    lights: Lights,
-    centroids: Centroids,
-    attitude: Attitude,
-    rate: RateEstimate,
-) -> Attitude:
-    """Return the attitude with its rate, and with the rate's error added to the covariance."""
-    match = attitude.match
-    cam_from_ref = attitude.cam_from_ref
-    assert match is not None
-    assert cam_from_ref is not None
-    assert attitude.covariance_rad2 is not None
-    lens = _lens(attitude, camera)
-    seen = lights.with_errors(centroids.take(match.observed), match.star)
-    place = cam_from_ref.apply(lights.place_ref[match.star])
-    jacobian = tangent_jacobian(place, place - lights.lever_cam_m).reshape(-1, 2, 3)
-    by_rate = rolling.rate_covariance_rad2(lens, seen, jacobian, rate.covariance_rad2_s2)
-    return replace(attitude, covariance_rad2=attitude.covariance_rad2 + by_rate, rate=rate)
 
 
 def with_streak_rate(

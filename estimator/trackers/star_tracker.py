@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import datetime
 import functools
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -120,7 +119,14 @@ class StarTracker(FrameTracker):
     ) -> None:
         checks.of_type("camera", camera, Camera)
         default = getattr(settings, "identifier", "default") == "default"
-        check_algorithms(settings, ["default"] if default else _published(), SOLVERS)
+        names = ["default"]
+        if not default:
+            from estimator.identification.registry import (
+                IDENTIFIERS,
+            )  # several compiled modules
+
+            names = list(IDENTIFIERS)
+        check_algorithms(settings, names, SOLVERS)
         focal_uncertainty = checks.number(
             "focal_uncertainty", focal_uncertainty, 0.0, 0.5, "0 to 0.5, relative"
         )
@@ -336,8 +342,7 @@ class StarTracker(FrameTracker):
     ) -> Attitude:
         """Identify and solve centroids of one time."""
         if self.index is None:
-            searches = self.searches if effort is None else self.searches[effort : effort + 1]
-            return self._identify_lights(centroids, searches, clock, effort is None)
+            return self._identify_lights(centroids, clock, effort)
         compared = np.zeros(1, np.int64)
         attitude = self._identify_by_paper(centroids, clock, self.index, compared)
         attitude = replace(attitude, angles_compared=int(compared[0]) or None)
@@ -502,22 +507,18 @@ class StarTracker(FrameTracker):
         return detections_of(flat_centroids(centroids, sigma_px), self.sensor, uncertainty)
 
     def _identify_lights(
-        self,
-        centroids: Centroids,
-        searches: tuple[SearchModel, ...],
-        clock: Clock,
-        names_scale: bool,
+        self, centroids: Centroids, clock: Clock, effort: int | None
     ) -> Attitude:
         """Solve by the default identifier, without a surplus of lights, and with double images as one light.
 
-        A refusal of all searches says whether another scale would be solved (`names_scale`).
+        A refusal of all searches says whether another scale would be solved.
         """
         camera = self.camera
         stars = len(self.stars) * self._field_sr / (4 * np.pi)
         most = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * stars))
         lights = lights_of(centroids, camera.width_px, camera.height_px, most)
-        attitude = self._identify_by_evidence(lights.centroids, searches, clock)
-        if names_scale and attitude.status in (BUDGET, FALSE_LIGHTS):
+        attitude = self._identify_by_evidence(lights.centroids, clock, effort)
+        if effort is None and attitude.status in (BUDGET, FALSE_LIGHTS):
             # A short search whose focal length is hardly known may find a decisive one out of range.
             sigma_px = self.sigma_px(lights.centroids)
             found, _ = self._search(lights.centroids, sigma_px, WRONG_SCALE_SEARCH)
@@ -543,7 +544,7 @@ class StarTracker(FrameTracker):
         return replace(of_frame(attitude), rivals=tuple(map(of_frame, attitude.rivals)))
 
     def _identify_by_evidence(
-        self, centroids: Centroids, searches: tuple[SearchModel, ...], clock: Clock
+        self, centroids: Centroids, clock: Clock, effort: int | None
     ) -> Attitude:
         """Solve by the default identifier.
 
@@ -555,7 +556,7 @@ class StarTracker(FrameTracker):
            also a field of view outside of its bounds, and a match that is not beyond chance.
         """
         status = NO_MATCH
-        for model in searches:
+        for model in self.searches if effort is None else [self.searches[effort]]:
             # 1. Search
             sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
             solution, variance = self._search(centroids, sigma_px, model)
@@ -684,8 +685,8 @@ class StarTracker(FrameTracker):
         """Return the attitude of a solution; solved again from its matches if the settings name another solver."""
         solution, camera, variance, _, detections = refitted
         has_floor = self.settings.centroid_sigma_px is None and detections is not None
+        searched_px = self.settings.searched_sigma_px
         if has_floor and not camera.focal_sigma:
-            searched_px = self.settings.searched_sigma_px
             solution, floor_px2 = misfit.with_floor(
                 solution, detections, self.sky, searched_px, self.camera.focal_px
             )
@@ -706,10 +707,19 @@ class StarTracker(FrameTracker):
                 cam_from_ref = SOLVERS[solver](rays, vectors, sigma_rad)
                 covariance_rad2 = covariance(rays, sigma_rad, solver)
             if camera.focal_sigma:
+                # Variances of the centroids' noise, with the floor that the residuals imply. The error of the focal
+                # length is common to all stars: an unknown of the residuals, not a noise.
+                focal_px2 = focal_error_px(camera, centroids.xy_px) ** 2
                 if has_floor:
-                    noise_px2 = self._noise_px2(centroids, solution, sigma_px)
+                    noise_px2 = sigma_px**2 - focal_px2
+                    free = self.detections(
+                        centroids, np.sqrt(noise_px2), star_search.WRONG_FOCAL
+                    )
+                    _, floor_px2 = misfit.with_floor(
+                        solution, free, self.sky, searched_px, self.camera.focal_px
+                    )
+                    noise_px2 = noise_px2 + floor_px2 - searched_px**2
                 else:
-                    focal_px2 = focal_error_px(camera, centroids.xy_px) ** 2
                     noise_px2 = variance * sigma_px**2 - focal_px2
                 noise_px2 = noise_px2[solution.observed]
                 seen_cam = cam_from_ref.apply(vectors)
@@ -724,25 +734,3 @@ class StarTracker(FrameTracker):
         return Attitude(
             "solved", cam_from_ref, covariance_rad2, match, rms_px, camera, common_rad2
         )
-
-    def _noise_px2(
-        self, centroids: Centroids, solution: Solution, sigma_px: Floats
-    ) -> Floats:
-        """Return the (N,) variances of the centroids' noise, with the floor that a solution's residuals imply.
-
-        The error of the focal length is common to all stars: an unknown of the residuals, not a noise.
-        """
-        noise_px2 = sigma_px**2 - focal_error_px(self.camera, centroids.xy_px) ** 2
-        searched_px = self.settings.searched_sigma_px
-        free = self.detections(centroids, np.sqrt(noise_px2), star_search.WRONG_FOCAL)
-        _, floor_px2 = misfit.with_floor(
-            solution, free, self.sky, searched_px, self.camera.focal_px
-        )
-        return noise_px2 + floor_px2 - searched_px**2
-
-
-def _published() -> Mapping[str, Callable[..., StarMatch | None]]:
-    """Return the identifiers by name; imported here, since the default does not need their compiled modules."""
-    from estimator.identification.registry import IDENTIFIERS
-
-    return IDENTIFIERS

@@ -334,9 +334,7 @@ class AssumptionPool:
         if cost[best] < self.cost:
             self.cost = float(cost[best])
             self.star = star[best]
-            self.p, self.missing = _chance_statistics(
-                self.stars, primary, star[best], self.field_tan
-            )
+            self.p, self.missing = self._chance_statistics(primary)
             # A new best: all earlier assumptions are compared with it again.
             self._contradictions = np.array([0.0, 0.0, np.inf])
             for earlier in self.assumptions:
@@ -344,10 +342,54 @@ class AssumptionPool:
         else:
             add_contradictions(*assumed, self.star, self._contradictions)
 
+    def _chance_statistics(self, primary: Primary) -> tuple[float, float]:
+        """Chance statistics of the best assumption's attitude.
+
+        In a field of uniform density, n stars of similar brightness in the solid angle Omega give an area A at least
+        one with the probability 1 - exp(-n A / Omega). A is the area of the gates of an observed star.
+
+        Returns
+        -------
+        p
+            Mean probability that an observed star finds a partner by chance
+        missing
+            Number of catalog stars that are predicted in the field and not matched
+        """
+        # Catalog stars in the field at the assumption's attitude.
+        stars = self.stars
+        pair = self.star[primary.rows]
+        R_cam_from_ref = primary.triad.T @ triad(
+            stars.vectors[pair[0]], stars.vectors[pair[1]]
+        )
+        predicted = stars.vectors @ R_cam_from_ref.T
+        left, right, top, bottom = self.field_tan
+        x, y, z = predicted.T
+        field = (z > 0) & (x > left * z) & (x < right * z) & (y > top * z) & (y < bottom * z)
+        from_midpoint_rad = 2 * np.arcsin(
+            np.minimum(np.linalg.norm(predicted - primary.midpoint, axis=1) / 2, 1.0)
+        )
+        # Those that can be partners: within reach of the pair, and not of the pair itself.
+        rows = np.flatnonzero(field & (from_midpoint_rad < primary.reach_rad))
+        rows = rows[(rows != pair[0]) & (rows != pair[1])]
+        # Of these, the number of similar brightness, for each observed star.
+        difference_mag = np.abs(
+            stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows]
+        )
+        # NaN > x is False: an unknown magnitude passes.
+        similar = len(rows) - (difference_mag > 3 * stars.gates.magnitude).sum(axis=1)
+        cap_sr = 2 * np.pi * (1 - np.cos(primary.reach_rad))
+        p = float(np.mean(1 - np.exp(-similar * primary.area_sr / cap_sr)))
+        return p, max(int(field.sum()) - self._matches, 0)
+
+    @property
+    def _matches(self) -> int:
+        """Number of stars that the best assumption identifies."""
+        return int((self.star >= 0).sum())
+
     @property
     def is_complete(self) -> bool:
         """Whether the best assumption identifies MIN_MATCHES stars."""
-        return int((self.star >= 0).sum()) >= MIN_MATCHES
+        return self._matches >= MIN_MATCHES
 
     @property
     def log10_chance(self) -> float:
@@ -358,12 +400,11 @@ class AssumptionPool:
         """
         # The pair defines the attitude: the other stars are trials.
         trials = len(self.star) - 2
-        hits = int((self.star >= 0).sum()) - 2
         if not self.is_complete:
             return 0.0
         count, matches, _ = self._contradictions
         match_rate = matches / count / trials if count else 0.0
-        tail = log10_tail(trials, hits, max(self.p, match_rate))
+        tail = log10_tail(trials, self._matches - 2, max(self.p, match_rate))
         return tail + self.missed_dex * self.missing + float(np.log10(self.count))
 
     def best_match(self, by_paper: bool = False) -> StarMatch | None:
@@ -374,19 +415,21 @@ class AssumptionPool:
         by this rule, too.
         """
         count, _, rival_cost = self._contradictions
-        if by_paper:
-            is_alone = not count or rival_cost > self.cost + 2 * np.log(TENFOLD)
-            is_named = self.is_complete and np.mean(self.star >= 0) >= MOST_LIGHTS
-            return self._solution(float("nan")) if is_named and is_alone else None
-        chance = self.log10_chance
         # A cost is -2 ln(likelihood): 1e5 times as likely is a cost smaller by 2 ln 1e5.
-        margin = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
-        if chance > ACCEPT_LOG10_CHANCE or (count and rival_cost < self.cost + margin):
+        if by_paper:
+            chance = float("nan")
+            is_alone = not count or rival_cost > self.cost + 2 * np.log(TENFOLD)
+            is_significant = (
+                self.is_complete and float(np.mean(self.star >= 0)) >= MOST_LIGHTS
+            )
+        else:
+            chance = self.log10_chance
+            margin = -2 * np.log(10) * ACCEPT_LOG10_CHANCE
+            is_alone = not count or rival_cost >= self.cost + margin
+            is_significant = chance <= ACCEPT_LOG10_CHANCE
+        if not (is_significant and is_alone):
             return None
-        return self._solution(chance)
-
-    def _solution(self, chance: float) -> StarMatch:
-        """The best assumption with the attitude of all its matches."""
+        # The attitude of all its matches
         observed = np.flatnonzero(self.star >= 0)
         star = self.star[observed].astype(np.int64)
         cam_from_ref = quest(
@@ -435,45 +478,3 @@ def _primary_pairs(
             angle = float(angles[a, rank_sum - a])
             if 4 * 3 * gates.separation_rad < angle <= max_rad + gate_rad(gates, angle):
                 yield a, rank_sum - a, angle
-
-
-def _chance_statistics(
-    stars: SearchInput,
-    primary: Primary,
-    star: Ints,
-    field_tan: tuple[float, float, float, float],
-) -> tuple[float, float]:
-    """Chance statistics of an assumption's attitude.
-
-    In a field of uniform density, n stars of similar brightness in the solid angle Omega give an area A at least
-    one with the probability 1 - exp(-n A / Omega). A is the area of the gates of an observed star.
-
-    Returns
-    -------
-    p
-        Mean probability that an observed star finds a partner by chance
-    missing
-        Number of catalog stars that are predicted in the field and not matched
-    """
-    # Catalog stars in the field at the assumption's attitude.
-    pair = star[primary.rows]
-    R_cam_from_ref = primary.triad.T @ triad(stars.vectors[pair[0]], stars.vectors[pair[1]])
-    predicted = stars.vectors @ R_cam_from_ref.T
-    left, right, top, bottom = field_tan
-    x, y, z = predicted.T
-    field = (z > 0) & (x > left * z) & (x < right * z) & (y > top * z) & (y < bottom * z)
-    from_midpoint_rad = 2 * np.arcsin(
-        np.minimum(np.linalg.norm(predicted - primary.midpoint, axis=1) / 2, 1.0)
-    )
-    # Those that can be partners: within reach of the pair, and not of the pair itself.
-    rows = np.flatnonzero(field & (from_midpoint_rad < primary.reach_rad))
-    rows = rows[(rows != pair[0]) & (rows != pair[1])]
-    # Of these, the number of similar brightness, for each observed star.
-    difference_mag = np.abs(
-        stars.magnitude_cam[primary.others][:, None] - stars.magnitude[rows]
-    )
-    # NaN > x is False: an unknown magnitude passes.
-    similar = len(rows) - (difference_mag > 3 * stars.gates.magnitude).sum(axis=1)
-    cap_sr = 2 * np.pi * (1 - np.cos(primary.reach_rad))
-    p = float(np.mean(1 - np.exp(-similar * primary.area_sr / cap_sr)))
-    return p, max(int(field.sum()) - int((star >= 0).sum()), 0)

@@ -25,6 +25,7 @@ from estimator.calibration.mass_dynamics import (
     inertia_six,
 )
 from estimator.core.errors import ImageError
+from estimator.filter import correct
 from estimator.filter.error_models import TrackerModel
 from tests.helpers.bearing_motion import SMALL, prior, record
 from tests.helpers.laws import SEEDS, assert_covariance, law, turn
@@ -338,12 +339,12 @@ def test_the_first_momentum_of_a_filter_is_as_uncertain_as_its_rate() -> None:
     np.testing.assert_allclose(np.cov(momenta.T), covariance, rtol=0, atol=0.02 * size)
 
 
-@law(mass_properties.symmetric_root)
+@law(correct.root)
 @given(rng=SEEDS)
 def test_the_square_of_a_symmetric_root_is_the_matrix(rng: np.random.Generator) -> None:
     half = rng.standard_normal((4, 3, 2))  # of rank 2
     matrix = half @ half.transpose(0, 2, 1)
-    root = mass_properties.symmetric_root(matrix)
+    root = correct.root(matrix)
     np.testing.assert_allclose(root @ root, matrix, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(root, root.transpose(0, 2, 1), rtol=0, atol=1e-12)
 

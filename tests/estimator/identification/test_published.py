@@ -507,15 +507,14 @@ def test_saa_s_chance_counts_the_stars_within_its_reach() -> None:
     )
     share = primary.area_sr / (2 * np.pi * (1 - np.cos(primary.reach_rad)))
     # Star 3 of the field is seen and has no partner.
-    p, missing = SAA._chance_statistics(
-        stars, primary, np.array([0, 1, 2, -1]), (-0.3, 0.08, -0.1, 0.07)
-    )
+    pool = SAA.AssumptionPool(stars, (-0.3, 0.08, -0.1, 0.07), 0.0)
+    pool.star = np.array([0, 1, 2, -1])
+    p, missing = pool._chance_statistics(primary)
     assert p == pytest.approx(np.mean(-np.expm1(-similar * share)), rel=1e-9)
     assert missing == np.count_nonzero(in_field) - 3
-    alone = stars._replace(vectors=seen, magnitude_cam=seen_mag, magnitude=magnitude[:4])
-    assert (
-        SAA._chance_statistics(alone, primary, np.arange(4), (-0.3, 0.08, -0.1, 0.07))[1] == 0
-    )
+    pool.stars = stars._replace(vectors=seen, magnitude_cam=seen_mag, magnitude=magnitude[:4])
+    pool.star = np.arange(4)
+    assert pool._chance_statistics(primary)[1] == 0
 
 
 @pytest.mark.parametrize("base", [5, 9])

@@ -105,12 +105,12 @@ def test_templates_are_those_of_the_exposure_about_its_middle(
         eye.solve_centroids(lights(), exposure_s=0.06, t_s=1.0, frame=4).status == COLLECTING
     )
     level, error = eye.code.templates(4, 0.97, 1.03)
-    np.testing.assert_allclose(eye.templates[:, :, 2], level)
-    np.testing.assert_allclose(eye.spread[:, :, 2], error)
-    assert not eye.templates[:, :, [0, 1, 3, 4, 5]].any()
+    np.testing.assert_allclose(eye.templates[0, :, :, 2], level)
+    np.testing.assert_allclose(eye.templates[1, :, :, 2], error)
+    assert not eye.templates[..., [0, 1, 3, 4, 5]].any()
     found = eye.solve_centroids(lights(0), t_s=2.0)
     assert found.status == NO_LIGHTS
-    np.testing.assert_allclose(eye.templates[:, :, 2], eye.code.templates(0, 2.0, 2.0)[0])
+    np.testing.assert_allclose(eye.templates[..., 2], eye.code.templates(0, 2.0, 2.0))
 
 
 @pytest.mark.parametrize(("bit_time_s", "least"), [(None, 3), (0.1, 8)])
@@ -218,10 +218,9 @@ def test_phases_are_kept_within_25_of_the_best_with_their_neighbors(
         led = np.rint(templates[:, 1]).astype(int)
         return (sums[phase] / 2 + np.abs(led - 1))[None]
 
-    eye.templates = np.empty((16, 3, 2))
-    eye.templates[:, :, 0] = np.arange(16)[:, None]
-    eye.templates[:, :, 1] = np.arange(3)
-    eye.spread = np.zeros_like(eye.templates)
+    eye.templates = np.zeros((2, 16, 3, 2))
+    eye.templates[0, :, :, 0] = np.arange(16)[:, None]
+    eye.templates[0, :, :, 1] = np.arange(3)
     monkeypatch.setattr(led_codes, "misfits", fake)
     monkeypatch.setattr(led_codes, "likely", lambda row, templates: np.arange(len(templates)))
     eye.phases[:] = True
@@ -272,9 +271,9 @@ def test_a_tracker_waits_for_leds_that_may_be_dark(dark: float, patience: int) -
     assert eye.tracks.radius_m == pytest.approx(
         np.median(np.linalg.norm(eye.leds.position_m, axis=1))
     )
-    assert eye.templates.shape == (1, 12, 6)
+    assert eye.templates.shape == (2, 1, 12, 6)
     longer = tracker(levels=levels, frames=9)
-    assert longer.templates.shape == (1, 12, 9)
+    assert longer.templates.shape == (2, 1, 12, 9)
     assert longer.tracks.frames == 9
     np.testing.assert_allclose(np.linalg.norm(eye.sphere.direction, axis=1), 1)
 
