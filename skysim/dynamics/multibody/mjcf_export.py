@@ -280,7 +280,7 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
     azimuth = np.linspace(0, 2 * np.pi, SECTORS, endpoint=False)
     # 1. Panel: circles about its center, clipped to its edges.
     if isinstance(inside, Plane):
-        outer_m = inside.height_m * np.tan(min(cap_rad + 0.1, 1.3))
+        outer_m = inside.center_m[2] * np.tan(min(cap_rad + 0.1, 1.3))
         radius_m = np.linspace(1e-3, outer_m, RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
         around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)

@@ -99,20 +99,19 @@ class Surface(ABC):
 
     def meet(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
-        R_lab_from_own = self.lab_from_own.as_matrix()
-        # A rotation keeps lengths, so the distance along the ray is the same in both frames.
-        start = (origin_m - self.center_m) @ R_lab_from_own
-        along = rays @ R_lab_from_own
+        start, along = self.own_rays(origin_m, rays)
         distance = self.distance(start, along)
         within = self.within(start + distance[:, None] * along)
         return origin_m + np.where(within, distance, np.nan)[:, None] * rays
 
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
+        return self.distance(*self.own_rays(origin_m, rays))
+
+    def own_rays(self, origin_m: Floats, rays: Floats) -> tuple[Floats, Floats]:
+        """Origin and rays of the lab in the surface's own frame; a rotation keeps lengths and distances."""
         R_lab_from_own = self.lab_from_own.as_matrix()
-        return self.distance(
-            (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
-        )
+        return (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
 
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
@@ -131,7 +130,7 @@ class Surface(ABC):
         min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
         ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
         sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-        rays = unit_vectors(*np.meshgrid(ring_z, sectors, indexing="ij")).reshape(-1, 3)
+        rays = unit_vectors(ring_z[:, None], sectors).reshape(-1, 3)
         # Keep the rays that meet the surface within its rim.
         met = self.meet(np.zeros(3), self.lab_from_own.apply(rays))
         return met[np.isfinite(met[:, 0])]
@@ -212,11 +211,6 @@ class Plane(Surface):
     """
 
     half_m: Floats = field(default_factory=lambda: np.full(2, np.inf))
-
-    @property
-    def height_m(self) -> float:
-        """Height of its center above the bearing."""
-        return float(self.center_m[2])
 
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
         return own_m[:, 2], np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
@@ -533,7 +527,7 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     least = np.cos(np.radians(cap_deg))
     cosine = (1 + least) / 2 + (1 - least) / 2 * node
     azimuth = np.arange(AREA_SECTORS) * (2 * np.pi / AREA_SECTORS)
-    rays = unit_vectors(*np.meshgrid(cosine, azimuth, indexing="ij")).reshape(-1, 3)
+    rays = unit_vectors(cosine[:, None], azimuth).reshape(-1, 3)
     place_m = surface.meet(np.zeros(3), rays)
     met = np.isfinite(place_m[:, 0])
     place_m = place_m[met]
