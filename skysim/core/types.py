@@ -313,6 +313,11 @@ class Sources:
     def __len__(self) -> int:
         return len(self.id)
 
+    @property
+    def xyz(self) -> Floats:
+        """(N, 3) positions of the LEDs in m, and directions of the stars."""
+        return self.place[:, :3]
+
     def take(self, which: NDArray) -> "Sources":
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
@@ -330,7 +335,7 @@ class StarSources(Sources):
     def by_z(self) -> tuple[Ints, Floats]:
         """Rows in ascending order of z, and their directions (N, 3) in this order."""
         order = np.argsort(self.place[:, 2], kind="stable")
-        return order, np.ascontiguousarray(self.place[order, :3])
+        return order, np.ascontiguousarray(self.xyz[order])
 
     def within(self, direction: Floats, angle_rad: float) -> Ints:
         """Ascending rows of the stars within an angle of a unit vector.

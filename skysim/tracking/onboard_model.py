@@ -47,11 +47,11 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     """
     inside = surface.build_surface(light.surface)
     survey = scene.tracker.survey
-    position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
+    position_m = survey_errors.assumed_leds_m(inside, sources.xyz, survey)
     board = registry.board_of(light.layout, sources.id)
     ellipsoid = survey_errors.assumed_ellipsoid(inside, survey)
-    covariance_m2 = survey_errors.led_covariance_m2(sources.place[:, :3], survey)
-    common_m = survey_errors.common_displacements_m(inside, sources.place[:, :3], survey)
+    covariance_m2 = survey_errors.led_covariance_m2(sources.xyz, survey)
+    common_m = survey_errors.common_displacements_m(inside, sources.xyz, survey)
     sigma_m = float(survey.led_sigma_m)
     if covariance_m2 is not None:
         sigma_m = float(survey_errors.across_sigma_m(position_m, covariance_m2).max())

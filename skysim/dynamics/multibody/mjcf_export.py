@@ -382,7 +382,7 @@ def brightest(
     stars = bool((sources.place[:, 3] == 0).any())
     rows = np.argsort(-mean, kind="stable")[: most_stars if stars else most_leds]
     fraction = mean[rows] / mean.max(initial=1e-300)
-    position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
+    position_m = sources.xyz[rows] * (SKY_RADIUS_M if stars else 1.0)
     sizes_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(rows), LED_RADIUS_M)
     return stars, rows, fraction, position_m, sizes_m
 

@@ -291,7 +291,7 @@ class LedErrors(NamedTuple):
 
 def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:
     """LED position errors before and after the survey."""
-    true_m = lab.camera.sources.place[:, :3]
+    true_m = lab.camera.sources.xyz
     row = np.flatnonzero(survey.surveyed)
     position_m = survey.leds.position_m[row]
     _, nearest = cKDTree(true_m).query(position_m)

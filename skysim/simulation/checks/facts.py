@@ -260,7 +260,7 @@ def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     if getattr(points, "boards", ()):
         return None
     listed = points.kind == "listed"
-    cap_deg = max_tilt_deg(plan.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
+    cap_deg = max_tilt_deg(plan.lab.camera.sources.xyz) if listed else points.cap_deg
     if tilt_deg is None:
         tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
     edge = field_reach_deg(plan, max(camera.width_px, camera.height_px) / 2, tilt_deg)

@@ -255,7 +255,7 @@ def dome_warnings(lab: Lab) -> list[str]:
     # width D f / d. Defocus of a thin lens with the pupil A adds A |1 / d - 1 / focus| f.
     if scene.tracker.detector == "local":
         camera = scene.camera
-        distance_m = np.linalg.norm(sources.place[:, :3], axis=1)
+        distance_m = np.linalg.norm(sources.xyz, axis=1)
         typical_m = float(
             np.median(distance_m - np.linalg.norm(lab.camera.mount.camera_body_m))
         )
@@ -361,7 +361,7 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     typical_px = float(np.median(np.concatenate(sigma_px)))
     coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px
     # 2. Greatest tilt of the fields, reduced to what most_work allows.
-    place_m = plan.beliefs.lights.place[:, :3]
+    place_m = plan.beliefs.lights.xyz
     most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
     zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
     tilt_rad = math.radians(plan.reach.attitudes.tilts_deg.max())

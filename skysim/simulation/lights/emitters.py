@@ -203,7 +203,7 @@ class StarsInOrbit(KnownLight):
         assert isinstance(self.sources, StarSources)
         near = self.sources.take(self.sources.within(view.boresight, reach_rad))
         now_m_s = 1e3 * exposure.observer.velocity_km_s
-        direction = stars.seen_at_velocity(near.place[:, :3], self.velocity_m_s, now_m_s)
+        direction = stars.seen_at_velocity(near.xyz, self.velocity_m_s, now_m_s)
         place = np.column_stack([direction, np.zeros(len(near))])
         return Lit("stars", True, replace(near, place=place), self.emitter)
 

@@ -174,7 +174,7 @@ def panel_sources(
         For a star nearer to black than to the first gray level.
     """
     # In the panel's own frame, and back from the rounded places.
-    own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
+    own_m = panel.lab_from_own.inv().apply(stars.xyz - panel.center_m)
     blocks = visible_blocks(
         config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band)
     )
@@ -458,9 +458,7 @@ def projector_sources(
             "light.layout.position", f"{config.position_m} m is outside of the dome", "inside"
         )
     # 1.
-    chip_m, shown = on_chip_m(
-        config, own_from_lab(config).apply(stars.place[:, :3] - position_m)
-    )
+    chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.xyz - position_m))
     if not shown.all():
         raise InputError(
             "light.layout.points",

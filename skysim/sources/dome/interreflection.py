@@ -84,7 +84,7 @@ def diffuse_light(
     # 2. Direct light, with the strengths averaged over the pulses.
     duty = np.minimum(leds.on_s / leds.period_s, 1.0)
     sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
-    place_m = np.ascontiguousarray(leds.place[:, :3])
+    place_m = np.ascontiguousarray(leds.xyz)
     emitters = Emitters(place_m, leds.normal, leds.strength * duty, sampled)
     direct = irradiance(patches.place_m, patches.normal, emitters)
     # 3. Sum over the patches: K rho A E.

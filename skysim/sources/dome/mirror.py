@@ -67,8 +67,8 @@ def mirrored(
     if not wall.inside(camera_m):
         return leds.take(np.zeros(0, np.int64))
     # 1.
-    led, start = nearest_rays(wall, leds.place[:, :3], camera_m, grid)
-    led_m = leds.place[led, :3]
+    led, start = nearest_rays(wall, leds.xyz, camera_m, grid)
+    led_m = leds.xyz[led]
     toward = grid.reshape(-1, 3)[start]
     # 2. A step is limited, since far from the solution the linear law may lead anywhere.
     for _ in range(STEPS):

@@ -277,7 +277,7 @@ def claimed_image_px(
     if isinstance(estimator, DomeTracker):
         rows = rows_of(estimator.leds.id[match.star], lab.camera.sources.id)
         camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
-        offset_lab = lab.camera.sources.place[rows, :3] - camera_m
+        offset_lab = lab.camera.sources.xyz[rows] - camera_m
     else:
         assert isinstance(estimator, StarTracker)
         offset_lab = estimator.stars.vectors[match.star]

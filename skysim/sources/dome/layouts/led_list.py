@@ -33,7 +33,7 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     of the drive, without the scatter from LED to LED.
     """
     leds = design_leds(config, build_surface(config.surface), band)
-    place_m = leds.place[:, :3]
+    place_m = leds.xyz
     full = full_strength_e_s_sr(ideal_led(config.led), band)
     level = leds.strength / max(full, float(leds.strength.max()))
     azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360

@@ -262,7 +262,7 @@ def displace_ends(config: FibersConfig, surface: Surface, fibers: Sources) -> So
     50 mm off: 34"). Normals are those of the design. The random stream is that of config.points.hardware_seed.
     """
     seed = config.points.hardware_seed
-    place_m = fibers.place[:, :3]
+    place_m = fibers.xyz
     drawn = random_stream(seed, SHELL_STREAM).uniform(-1, 1, len(fibers))
     fraction = config.radius_variation * drawn
     outward_m = fraction * np.linalg.norm(place_m, axis=1)
