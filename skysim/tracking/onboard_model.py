@@ -165,7 +165,7 @@ def surveyed_dome(
     """
     # 1. The file is of this camera and of LEDs of this dome.
     dome_map = dome_map_file.read_dome_map(Path(path))
-    size_px = (scene.camera.width_px, scene.camera.height_px)
+    size_px = scene.camera.size_px
     if dome_map.size_px != size_px:
         raise InputError(
             "tracker.map",

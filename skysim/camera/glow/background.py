@@ -148,8 +148,7 @@ class PointedCamera(NamedTuple):
         camera = self.optics.camera
         smooth_px = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
         spacing = spacing_px or smooth_px
-        size_px = camera.width_px, camera.height_px
-        return self.grid(*(math.ceil((size - 1) / spacing) + 1 for size in size_px))
+        return self.grid(*(math.ceil((size - 1) / spacing) + 1 for size in camera.size_px))
 
     def grid(self, columns: int, rows: int) -> ViewingGeometry:
         """The geometry of nodes that are evenly spread from corner to corner, row by row."""

@@ -155,8 +155,7 @@ def source_kernels(
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
     defocus = blur_radius_px(camera, axial_m, chromatic[:, 0])
-    size = np.array([camera.width_px, camera.height_px])
-    outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
+    outside_px = np.maximum(np.maximum(-position, position - camera.size_px), 0).max(axis=1)
     # Sources far outside the frame have no image.
     near = (outside_px < MAX_RADIUS_PX)[:, None]
     radii_px = np.where(near, np.column_stack([emitter, defocus]), 0.0)

@@ -427,8 +427,7 @@ def field_corners(
     the sky.
     """
     # Corners are half a pixel outside of the outer pixels' centers.
-    size_px = np.array([camera.width_px, camera.height_px])
-    corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size_px - 0.5
+    corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * camera.size_px - 0.5
     xy_px = corners_px - camera.center_px
     rays_cam = np.column_stack([xy_px, np.full(4, camera.focal_px)])
     lab_from_cam = lab_from_body * mount.cam_from_body.inv()

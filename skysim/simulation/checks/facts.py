@@ -263,7 +263,7 @@ def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     cap_deg = max_tilt_deg(plan.lab.camera.sources.xyz) if listed else points.cap_deg
     if tilt_deg is None:
         tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
-    edge = field_reach_deg(plan, max(camera.width_px, camera.height_px) / 2, tilt_deg)
+    edge = field_reach_deg(plan, max(camera.size_px) / 2, tilt_deg)
     corner = field_reach_deg(plan, camera.corner_px, tilt_deg)
     return CapMargin(cap_deg, tilt_deg, edge, corner, points.cap_deg)
 

@@ -122,7 +122,7 @@ def simulate_detections(
     false = trial.false_lights + round(
         len(detected) * trial.false_share / (1 - trial.false_share)
     )
-    false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
+    false_px = rng.random((false, 2)) * scene.camera.size_px - 0.5
     if len(flux):
         false_flux = flux[rng.integers(len(flux), size=false)]
     else:
