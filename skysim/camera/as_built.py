@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
-from skysim.core.types import Floats, Mount, Sources, normalized
+from skysim.core.types import UP, Floats, Mount, Sources, normalized
 from skysim.scene.sections.surroundings import (
     LinearTemperatureConfig,
     SineTemperatureConfig,
@@ -23,7 +23,6 @@ from skysim.scene.sections.surroundings import (
 )
 from skysim.scene.sections.vehicle import VehicleConfig
 
-UP = np.array([0.0, 0.0, 1.0])  # of the lab, and of a level body
 BORESIGHT = UP  # in camera axes
 
 

@@ -54,6 +54,8 @@ def taken(columns: Kind, which: Any) -> Kind:
     return table._make(column[which] for column in table)
 
 
+# Of the lab, and of a level body; in camera axes the boresight.
+UP = np.array([0.0, 0.0, 1.0])
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 

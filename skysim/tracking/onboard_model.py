@@ -23,7 +23,7 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints, Mount, Sources
+from skysim.core.types import UP, Floats, Ints, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
@@ -296,7 +296,7 @@ class OrbitStarTracker(StarTracker):
         """The attitude of a frame at a time since the start, corrected by the rotation b x dv / c."""
         if attitude.cam_from_ref is None:
             return attitude
-        boresight = attitude.cam_from_ref.inv().apply([0.0, 0.0, 1.0])
+        boresight = attitude.cam_from_ref.inv().apply(UP)
         changed_m_s = state_at(self.orbit, t_s).velocity_m_s - self.start_m_s
         changed = changed_m_s / catalog.SPEED_OF_LIGHT_M_S
         now_from_start = Rotation.from_rotvec(np.cross(boresight, changed))

@@ -25,7 +25,7 @@ from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
 from skysim.core.paths import DATA
 from skysim.core.time import J2000_JD
-from skysim.core.types import Floats, frozen, normalized
+from skysim.core.types import UP, Floats, frozen, normalized
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -157,7 +157,7 @@ class PointedCamera(NamedTuple):
         return ViewingGeometry(
             toward_cam=toward,
             toward_lab=lab_from_cam.apply(toward),
-            boresight_lab=lab_from_cam.apply([0.0, 0.0, 1.0]),
+            boresight_lab=lab_from_cam.apply(UP),
             pixel_sr=pixel_sr,
             shape=(rows, columns),
             optics=self.optics,

@@ -23,7 +23,7 @@ from skysim.camera.glow.background import (
     transmittance,
 )
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
-from skysim.core.types import Floats, normalized
+from skysim.core.types import UP, Floats, normalized
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import AirGlowConfig, EarthConfig
 from skysim.sources.air import Sky, air_mass
@@ -85,7 +85,7 @@ def earth_light(
 ) -> Floats | None:
     """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None if it is not in the field."""
     # The angle between boresight and nadir, and the angular radius of Earth and airglow.
-    boresight = camera.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    boresight = camera.cam_from_lab.inv().apply(UP)
     distance_m = float(np.linalg.norm(observer_m))
     cosine = float(-boresight @ observer_m) / distance_m
     from_nadir_rad = math.acos(max(min(cosine, 1.0), -1.0))

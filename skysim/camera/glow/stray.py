@@ -24,7 +24,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from skysim.camera.glow.background import PointedCamera, unproject
 from skysim.camera.optics import Optics
-from skysim.core.types import Floats, SourceTruth
+from skysim.core.types import UP, Floats, SourceTruth
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
 from skysim.sources.satellites import GHOST
@@ -158,7 +158,7 @@ def wall_glow(dome: ReflectingDome, camera: PointedCamera) -> Floats:
     if dome.config.floor:
         depth_m = camera_m[2] + dome.config.floor.depth_m
         floor_m = camera_m + meeting(few, depth_m)
-        up = np.tile([0.0, 0.0, 1.0], (len(floor_m), 1))
+        up = np.tile(UP, (len(floor_m), 1))
         met_m = camera_m + meeting(view.toward_lab, depth_m)
         axis_m = np.linalg.norm(met_m[:, :2], axis=1)
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)

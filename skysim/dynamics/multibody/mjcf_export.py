@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Ints, Mount, Sources, normalized
+from skysim.core.types import UP, Floats, Ints, Mount, Sources, normalized
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
@@ -104,7 +104,7 @@ def mjcf(
         add_dome(spec, rings_m)
         look_at(spec, *dome_view(rings_m))
     else:
-        boresight = lab_from_body.apply(mount.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
+        boresight = lab_from_body.apply(mount.cam_from_body.inv().apply(UP))
         look_at(spec, *sky_view(vehicle, boresight))
     # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
@@ -476,8 +476,7 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     middle = np.array([0.0, 0.0, top - size])
     # From the azimuth -62 deg and 8 deg above.
     toward_eye = Rotation.from_euler("ZY", [-62.0, -8.0], degrees=True).apply([1.0, 0.0, 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    return middle + distance * toward_eye, middle, up, 0.55 * distance
+    return middle + distance * toward_eye, middle, UP, 0.55 * distance
 
 
 def sky_view(

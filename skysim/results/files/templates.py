@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from skysim.core import files
 from skysim.core.constants import INCH_M
 from skysim.core.errors import check_name
-from skysim.core.types import Floats, normalized
+from skysim.core.types import UP, Floats, normalized
 from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
@@ -298,7 +298,7 @@ def shell_obj(dome: DomeDesign) -> str:
     rings_m = at(
         dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
     ).reshape(-1, 3)
-    vertices_m = np.concatenate([at(dome.surface, np.array([[0.0, 0.0, 1.0]])), rings_m])
+    vertices_m = np.concatenate([at(dome.surface, UP[None]), rings_m])
     lines = [
         f"# {dome.name}: inner surface and LEDs, mm from the bearing's center, z up",
         "o shell",

@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Sources, around_z, joined
+from skysim.core.types import UP, Floats, Sources, around_z, joined
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.light import DomeConfig, FloorConfig, ReflectionConfig
 from skysim.sources.dome.led import LOBES
@@ -124,7 +124,7 @@ def floor_patches(config: FloorConfig) -> Patches:
     area_m2 = np.full(PATCHES, np.pi * config.radius_m**2 / PATCHES)
     return Patches(
         place_m,
-        np.tile([0.0, 0.0, 1.0], (PATCHES, 1)),
+        np.tile(UP, (PATCHES, 1)),
         area_m2,
         np.full(PATCHES, config.share),
     )

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Record, around_z, frozen, normalized
+from skysim.core.types import UP, Bools, Floats, Record, around_z, frozen, normalized
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -213,7 +213,7 @@ class Plane(Surface):
     half_m: Floats = field(default_factory=lambda: np.full(2, np.inf))
 
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
-        return own_m[:, 2], np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
+        return own_m[:, 2], np.tile(UP, (len(own_m), 1))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """As `Surface.distance`; NaN for rays that point down."""
@@ -226,7 +226,7 @@ class Plane(Surface):
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """A sphere so large that it is flat to a micrometer within a meter."""
-        up = self.lab_from_own.apply([0.0, 0.0, 1.0])
+        up = self.lab_from_own.apply(UP)
         return FittedEllipsoid(
             self.center_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0
         )

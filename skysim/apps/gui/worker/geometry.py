@@ -10,7 +10,7 @@ from estimator.core.camera import Camera
 from skysim.apps.gui.messages import Lens, Pose, Triple
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Ints, Record, Sources, Trajectory, Truth
+from skysim.core.types import UP, Bools, Floats, Ints, Record, Sources, Trajectory, Truth
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, brightest
 from skysim.results import scoring
@@ -77,15 +77,14 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
     pupil_m = mount.camera_body_m
     height_m = np.linalg.norm(model.eye_m - model.target_m)
     field_deg = lab.scene.camera.calibration().field_deg[1]
-    up = np.array([0.0, 0.0, 1.0])
     north = np.array([0.0, 1.0, 0.0])
-    ahead = body_from_cam.apply([0.0, 0.0, 1.0])
+    ahead = body_from_cam.apply(UP)
     above = body_from_cam.apply([0.0, -1.0, 0.0])
     return {
-        "outside": (model.eye_m, model.target_m, up, FOVY_DEG, False),
+        "outside": (model.eye_m, model.target_m, UP, FOVY_DEG, False),
         "camera": (pupil_m, pupil_m + ahead, above, field_deg, True),
-        "bearing": (np.zeros(3), up, north, WIDE_DEG, False),
-        "top": (model.target_m + height_m * up, model.target_m, north, FOVY_DEG, False),
+        "bearing": (np.zeros(3), UP, north, WIDE_DEG, False),
+        "top": (model.target_m + height_m * UP, model.target_m, north, FOVY_DEG, False),
     }
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, normalized
+from skysim.core.types import UP, Floats, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
 from skysim.sources.dome.layouts.placing import (
@@ -93,7 +93,7 @@ def spread_boards(
     """
     half = np.radians(config.cap_deg)
     spacing_m = config.spacing_m or config.pitch_m
-    apex_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))[0, 2]
+    apex_m = project_from_bearing(surface, UP[None])[0, 2]
     if config.spread == "grid":
         directions = grid(spacing_m / apex_m, half)
         rotation = np.zeros(len(directions))

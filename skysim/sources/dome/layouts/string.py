@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Ints, Sources, normalized
+from skysim.core.types import UP, Floats, Ints, Sources, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.sources.dome.layouts.placing import PlacedLeds, dimmed, project_from_bearing
@@ -99,7 +99,7 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     tapes = WINDINGS[config.winding](config, surface, meridian)
     # A cap that is too small for a tape has one LED at the zenith.
     if not tapes:
-        zenith_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
+        zenith_m = project_from_bearing(surface, UP[None])
         return Wound(zenith_m, np.zeros(1, np.int64), np.zeros(1))
     # As many as fit; on a ring the last has a pitch to the first.
     fit = [int(tape.length_m[-1] / config.pitch_m) for tape in tapes]
