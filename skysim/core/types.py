@@ -31,6 +31,21 @@ def around_z(radius: Any, azimuth_rad: NDArray, z: Any) -> Floats:
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
+def azimuths_rad(places: Floats) -> Floats:
+    """(N,) azimuths of (N, 3) places from +x toward +y."""
+    return np.arctan2(places[:, 1], places[:, 0])
+
+
+def grid_points(x: Floats, y: Floats) -> Floats:
+    """(N, 2) points of a grid, row by row."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def positive(values: Floats) -> Floats:
+    """The values above zero, and NaN for the others."""
+    return np.where(values > 0, values, np.nan)
+
+
 Kind = TypeVar("Kind")
 
 
@@ -319,6 +334,11 @@ class Sources:
     def xyz(self) -> Floats:
         """(N, 3) positions of the LEDs in m, and directions of the stars."""
         return self.place[:, :3]
+
+    @property
+    def duty(self) -> Floats:
+        """(N,) fractions of the time for which they are lit."""
+        return np.minimum(self.on_s / self.period_s, 1.0)
 
     def take(self, which: NDArray) -> "Sources":
         """The sources selected by a mask or by indices."""

@@ -70,7 +70,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     )
     nominal = nominal.take(rows_of(leds.id, nominal.id))
     distance_m = leds.radius_m - np.linalg.norm(lever.camera_body_m)
-    strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
+    strength = nominal.strength * nominal.duty
     light_e_s_m2 = irradiance_e_s_m2(
         strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m
     )

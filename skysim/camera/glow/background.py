@@ -25,7 +25,7 @@ from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
 from skysim.core.paths import DATA
 from skysim.core.time import J2000_JD
-from skysim.core.types import UP, Floats, frozen, normalized
+from skysim.core.types import UP, Floats, frozen, grid_points, normalized
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -341,8 +341,7 @@ def even_grid_px(camera: CameraConfig, columns: int, rows: int) -> Floats:
     """(rows * columns, 2) pixel positions, evenly spread from corner to corner, row by row."""
     across = np.linspace(0, camera.width_px - 1, columns)
     down = np.linspace(0, camera.height_px - 1, rows)
-    x, y = np.meshgrid(across, down)
-    return np.column_stack([x.ravel(), y.ravel()])
+    return grid_points(across, down)
 
 
 def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:

@@ -211,7 +211,7 @@ def view(
     chosen = lit.points.take(row)
     # 2. Electrons.
     rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
-    electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * camera.exposure_s
+    electrons = rate_e_s * chosen.duty * camera.exposure_s
     # 3. Vectors, derivatives, paths.
     arm_m = exposure.cam_from_lab.apply(chosen.xyz)
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)

@@ -82,10 +82,9 @@ def diffuse_light(
     if config.floor:
         patches = joined([patches, floor_patches(config.floor)])
     # 2. Direct light, with the strengths averaged over the pulses.
-    duty = np.minimum(leds.on_s / leds.period_s, 1.0)
     sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
     place_m = np.ascontiguousarray(leds.xyz)
-    emitters = Emitters(place_m, leds.normal, leds.strength * duty, sampled)
+    emitters = Emitters(place_m, leds.normal, leds.strength * leds.duty, sampled)
     direct = irradiance(patches.place_m, patches.normal, emitters)
     # 3. Sum over the patches: K rho A E.
     transfer = kernel(patches) * (patches.reflectance * patches.area_m2)

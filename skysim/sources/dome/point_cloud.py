@@ -18,7 +18,7 @@ import scipy
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats, around_z, frozen
+from skysim.core.types import Floats, around_z, azimuths_rad, frozen
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -269,7 +269,7 @@ def read(file: str, unit: str) -> Floats:
 def covered_rad(unit: Floats) -> tuple[float, float]:
     """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
     angle = np.arctan2(np.hypot(*unit.T[:2]), unit[:, 2])
-    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
+    azimuth = azimuths_rad(unit)
     sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     # Of the farthest point in each sector of azimuth, the least.
     farthest = [float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS)]

@@ -17,7 +17,16 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import UP, Bools, Floats, Record, around_z, frozen, normalized
+from skysim.core.types import (
+    UP,
+    Bools,
+    Floats,
+    Record,
+    around_z,
+    frozen,
+    normalized,
+    positive,
+)
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -172,9 +181,9 @@ def exit_distance(start: Floats, along: Floats) -> Floats:
     c = start @ start - 1
     discriminant = b**2 - a * c
     q = np.abs(b) + np.sqrt(np.where((discriminant >= 0) & (a > 0), discriminant, np.nan))
-    q = np.where(q > 0, q, np.nan)
-    root = np.where(b > 0, -c / q, q / np.where(a > 0, a, np.nan))
-    return np.where(root > 0, root, np.nan)
+    q = positive(q)
+    root = np.where(b > 0, -c / q, q / positive(a))
+    return positive(root)
 
 
 @frozen
@@ -218,8 +227,8 @@ class Plane(Surface):
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """As `Surface.distance`; NaN for rays that point down."""
         # Only rays that point up meet the panel.
-        distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
-        return np.where(distance > 0, distance, np.nan)
+        distance = -start_m[2] / positive(along[:, 2])
+        return positive(distance)
 
     def within(self, own_m: Floats) -> Bools:
         return np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1)
@@ -360,7 +369,7 @@ class Radial(Surface):
             # 3.
             # Derivative of the level along the ray.
             slope = np.sum(gradient * along, axis=1)
-            step = distance - level / np.where(slope > 0, slope, np.nan)
+            step = distance - level / positive(slope)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
             before = np.abs(level)
             distance = np.where(

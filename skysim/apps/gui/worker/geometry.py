@@ -10,7 +10,17 @@ from estimator.core.camera import Camera
 from skysim.apps.gui.messages import Lens, Pose, Triple
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.types import UP, Bools, Floats, Ints, Record, Sources, Trajectory, Truth
+from skysim.core.types import (
+    UP,
+    Bools,
+    Floats,
+    Ints,
+    Record,
+    Sources,
+    Trajectory,
+    Truth,
+    grid_points,
+)
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, brightest
 from skysim.results import scoring
@@ -98,7 +108,7 @@ def lens_of(camera: Camera) -> Lens:
     """Tables of the tangents x / z and y / z of a camera's pixels, from the upper left to the lower right corner."""
     x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
     y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
-    tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    tangents = camera.tangents(grid_points(x, y))
     return Lens(NODES, *tangents.T.copy())
 
 

@@ -73,7 +73,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, optics, poses, ends)
     rate_e_s = rates_e_s(near, optics, camera.known.emitter, distance_m, cos_out, cos_in)
-    duty = np.minimum(near.on_s / near.period_s, 1.0)
+    duty = near.duty
     electrons = rate_e_s * duty * lab.scene.exposure.time_s
     x, y = xy_px.T
     width_px, height_px = camera.canvas.shape[::-1]
@@ -192,5 +192,5 @@ def brightness(lab: Lab, rows: Ints, frame: int) -> Floats:
     shown = dome.pulsed(dome.sources, lab.camera.run_seed, frame, window, middle_s).take(rows)
     pulses = np.column_stack([shown.period_s, shown.start_s, shown.on_s]).tolist()
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
-    mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
+    mean = steady.strength * steady.duty
     return shown.strength * lit_s / window.exposure_s / mean

@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints, normalized
+from skysim.core.types import Floats, Ints, normalized, positive
 
 
 class Fields(NamedTuple):
@@ -114,7 +114,7 @@ def fields_about(
     x_m = across @ place_m.T
     y_m = np.cross(up[center], across) @ place_m.T
     ahead_m = up[center] @ place_m.T - height_m
-    radius = np.hypot(x_m, y_m) / np.where(ahead_m > 0, ahead_m, np.nan)
+    radius = np.hypot(x_m, y_m) / positive(ahead_m)
     # The center LED is not its own neighbor.
     radius[np.arange(len(center)), center] = np.nan
     row, led = np.nonzero(radius <= math.tan(radius_rad))

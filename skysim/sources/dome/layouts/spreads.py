@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, around_z, normalized
+from skysim.core.types import Floats, around_z, azimuths_rad, normalized
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
     GeodesicConfig,
@@ -162,7 +162,7 @@ def geodesic(config: GeodesicConfig, surface: Surface, rng: Generator) -> Placed
     """LEDs at the geodesic vertices within the cap, numbered from the zenith, then by azimuth."""
     vertices = geodesic_vertices(config.frequency, config.class_)
     tilt_rad = tilts_rad(vertices)
-    azimuth_rad = np.arctan2(vertices[:, 1], vertices[:, 0])
+    azimuth_rad = azimuths_rad(vertices)
     # Rounded, so that vertices of equal tilt are in the order of their azimuths.
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
     order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
