@@ -115,7 +115,7 @@ def mount_at(vehicle: VehicleConfig, mount: Mount, lab_from_body: Rotation) -> M
     compliance_rad = ARCSEC_RAD * np.array([*vehicle.sag_arcsec, 0.0])
     turned_rad = compliance_rad * np.cross(BORESIGHT, down_cam)
     swung_m = np.cross(turned_rad, vehicle.mast_m * BORESIGHT)
-    pupil_m = mount.camera_body_m + mount.cam_from_body.inv().apply(swung_m)
+    pupil_m = mount.camera_body_m + mount.body_from_cam.apply(swung_m)
     # 2. Run-out. A level body is higher by q_z.
     deviation_m = np.array(vehicle.runout_m) * down_body
     lift_m = down_body @ deviation_m + vehicle.runout_m[2]

@@ -89,6 +89,11 @@ class Mount:
     camera_body_m: Floats
     cam_from_body: Rotation
 
+    @property
+    def body_from_cam(self) -> Rotation:
+        """Rotation of the camera frame into the body frame."""
+        return self.cam_from_body.inv()
+
     def toward(self, place: Floats, lab_from_body: Rotation) -> Floats:
         """(N, 3) vectors in camera axes from the pupil to places (N, 4), as in `Sources`, at an attitude."""
         toward_m = place[:, :3] - place[:, 3:] * lab_from_body.apply(self.camera_body_m)

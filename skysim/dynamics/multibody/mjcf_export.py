@@ -104,7 +104,7 @@ def mjcf(
         add_dome(spec, rings_m)
         look_at(spec, *dome_view(rings_m))
     else:
-        boresight = lab_from_body.apply(mount.cam_from_body.inv().apply(UP))
+        boresight = lab_from_body.apply(mount.body_from_cam.apply(UP))
         look_at(spec, *sky_view(vehicle, boresight))
     # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
@@ -430,7 +430,7 @@ def field_corners(
     corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * camera.size_px - 0.5
     xy_px = corners_px - camera.center_px
     rays_cam = np.column_stack([xy_px, np.full(4, camera.focal_px)])
-    lab_from_cam = lab_from_body * mount.cam_from_body.inv()
+    lab_from_cam = lab_from_body * mount.body_from_cam
     rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)
     length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
@@ -484,9 +484,7 @@ def sky_view(
 ) -> tuple[Floats, Floats, Floats, float]:
     """As `dome_view`, from beside and behind the vehicle, with the boresight along the picture's diagonal."""
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
-    # A direction across the boresight, from the axis that is least along it.
-    beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
-    back = normalized(beside) - 0.5 * boresight
+    back = surface.perpendicular(boresight[None])[0] - 0.5 * boresight
     up = Rotation.from_rotvec(np.radians(-40.0) * normalized(back)).apply(boresight)
     return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
 

@@ -283,7 +283,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     tilts = np.column_stack([azimuth, np.full(SIDES, math.radians(tilt_deg)), -azimuth])
     needed_deg = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", tilts):
-        rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
+        rays = lab_from_body.apply(mount.body_from_cam.apply(rays_cam))
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
         if np.isnan(met).any():
             return math.inf

@@ -200,7 +200,7 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     total = np.zeros((3, 3))
     main = lab.camera.mount.cam_from_body
     for camera, (cross, roll) in zip(lab.cameras, errors, strict=True):
-        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
+        R_main_from_cam = (main * camera.mount.body_from_cam).as_matrix()
         # The variance of cross is the sum of those about x and y, half of it each.
         information = 1 / np.array([cross**2 / 2, cross**2 / 2, roll**2])
         total += R_main_from_cam @ np.diag(np.nan_to_num(information)) @ R_main_from_cam.T

@@ -229,7 +229,7 @@ def view(
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
         exposure.time,
-        exposure.lab_from_body * camera.mount.cam_from_body.inv(),
+        exposure.lab_from_body * camera.mount.body_from_cam,
         row,
         xy_px,
         offset_m,

@@ -83,7 +83,7 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
     the vertical field of view, deg; and whether it is on the vehicle.
     """
     mount = lab.camera.mount
-    body_from_cam = mount.cam_from_body.inv()
+    body_from_cam = mount.body_from_cam
     pupil_m = mount.camera_body_m
     height_m = np.linalg.norm(model.eye_m - model.target_m)
     field_deg = lab.scene.camera.calibration().field_deg[1]
