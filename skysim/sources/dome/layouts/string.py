@@ -25,7 +25,7 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import UP, Floats, Ints, Sources, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
-from skysim.sources.dome.layouts.placing import PlacedLeds, dimmed, project_from_bearing
+from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.surface import Surface, directions, perpendicular
 
 STEPS_PER_TURN = 720
@@ -88,9 +88,9 @@ class Wound(NamedTuple):
     tape_m: Floats
 
 
-def string(config: StringConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def string(config: StringConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs of tapes, one every pitch along the surface. Raises InputError for too long a tape."""
-    return dimmed(config, surface, wind(config, surface).place_m, rng)
+    return wind(config, surface).place_m
 
 
 def wind(config: StringConfig, surface: Surface) -> Wound:
