@@ -200,7 +200,7 @@ NEAREST_DEG = 0.25
 
 
 def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
-    """(M,) electrons per second and pixel of the sky's glow, with the Sun's color; 0 below the skyline."""
+    """(h, w) electrons per second and pixel of the sky's glow, with the Sun's color; 0 below the skyline."""
     zenith_rad = math.pi / 2 - sky.altitude_rad(view.toward_lab)
     extinction_mag = sky.air.config.extinction_mag
     above = ~sky.below_horizon(view.toward_lab)
@@ -216,7 +216,7 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
             np.degrees(zenith_rad),
             extinction_mag,
         )
-    return nanolamberts_e_s(nanolamberts, view) * above
+    return (nanolamberts_e_s(nanolamberts, view) * above).reshape(view.shape)
 
 
 def seen_place(name: str, sky: Sky) -> Place:

@@ -160,7 +160,7 @@ def source_kernels(
     near = (outside_px < MAX_RADIUS_PX)[:, None]
     radii_px = np.where(near, np.column_stack([emitter, defocus]), 0.0)
     axes_px = radii_px[:, [0, 0]] if disks is None else disks.semi_axes_px()
-    check_radii(*radii_px.T, axes_px)
+    check_radii(radii_px, axes_px)
     keys = np.rint(np.column_stack([sigma, radii_px]) / QUANTUM_PX).astype(np.int64)
     # 2. Ellipses.
     disk = ellipses(keys, camera, disks, axes_px, sigma, *radii_px.T)
@@ -184,8 +184,9 @@ def source_kernels(
     return kernels
 
 
-def check_radii(emitter_px: Floats, defocus_px: Floats, axes_px: Floats) -> None:
+def check_radii(radii_px: Floats, axes_px: Floats) -> None:
     """Raise InputError for an image, of a disk with semi-axes axes_px (N, 2), larger than MAX_RADIUS_PX."""
+    emitter_px, defocus_px = radii_px.T
     widest = np.where(emitter_px > 0, np.fmax(emitter_px, axes_px[:, 0]), 0)
     largest = (widest + defocus_px).max(initial=0.0)
     if largest > MAX_RADIUS_PX:

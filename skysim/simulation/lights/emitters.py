@@ -132,9 +132,9 @@ class LedDome(KnownLight):
         if seed not in self._timing:
             while len(self._timing) >= MAX_RUNS:
                 self._timing.pop(next(iter(self._timing)))
-            clocks = build_clocks(self.config, self.sources, seed)
             self._timing[seed] = LedTiming(
-                clocks, build_codes(self.config, self.sources, seed)
+                build_clocks(self.config, self.sources, seed),
+                build_codes(self.config, self.sources, seed),
             )
         return self._timing[seed]
 
