@@ -36,6 +36,11 @@ def azimuths_rad(places: Floats) -> Floats:
     return np.arctan2(places[:, 1], places[:, 0])
 
 
+def homogeneous(rows: Floats, last: float) -> Floats:
+    """(N, K + 1) rows of (N, K) numbers, and a last one that all share."""
+    return np.column_stack([rows, np.full(len(rows), last)])
+
+
 def grid_points(x: Floats, y: Floats) -> Floats:
     """(N, 2) points of a grid, row by row."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)

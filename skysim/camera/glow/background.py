@@ -25,7 +25,7 @@ from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
 from skysim.core.paths import DATA
 from skysim.core.time import J2000_JD
-from skysim.core.types import UP, Floats, frozen, grid_points, normalized
+from skysim.core.types import UP, Floats, frozen, grid_points, homogeneous, normalized
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -381,8 +381,7 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
             plane = centered * (undistorted_r / np.maximum(distorted_r, 1e-300))[:, None]
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     # 3.
-    toward = np.column_stack([plane, np.ones(len(plane))])
-    return normalized(toward)
+    return normalized(homogeneous(plane, 1.0))
 
 
 def fill(image: NDArray, coarse: Floats, factor: float) -> None:

@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import UP, Floats, Ints, Mount, Sources, normalized
+from skysim.core.types import UP, Floats, Ints, Mount, Sources, homogeneous, normalized
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
@@ -429,7 +429,7 @@ def field_corners(
     # Corners are half a pixel outside of the outer pixels' centers.
     corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * camera.size_px - 0.5
     xy_px = corners_px - camera.center_px
-    rays_cam = np.column_stack([xy_px, np.full(4, camera.focal_px)])
+    rays_cam = homogeneous(xy_px, camera.focal_px)
     lab_from_cam = lab_from_body * mount.body_from_cam
     rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)

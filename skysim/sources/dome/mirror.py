@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from skysim.core.types import Bools, Floats, Ints, Sources, normalized
+from skysim.core.types import Bools, Floats, Ints, Sources, homogeneous, normalized
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
@@ -99,7 +99,7 @@ def mirrored(
     return replace(
         sources,
         id=sources.id + MIRRORED * numbered(led[found]),
-        place=np.column_stack([virtual_m, np.ones(len(sources))]),
+        place=homogeneous(virtual_m, 1.0),
         normal=sources.normal - 2 * across * normal,
         strength=sources.strength * reflectance(config, rays.cosine[found]),
     )

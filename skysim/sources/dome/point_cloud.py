@@ -18,7 +18,7 @@ import scipy
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats, around_z, azimuths_rad, frozen
+from skysim.core.types import Floats, around_z, azimuths_rad, frozen, homogeneous
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -68,7 +68,7 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
     scale_m = np.ptp(points_m, axis=0).max()
     scaled = (points_m - mean_m) / scale_m
     # 1.
-    design = np.column_stack([2 * scaled, np.ones(len(scaled))])
+    design = homogeneous(2 * scaled, 1.0)
     algebraic, _, rank, _ = np.linalg.lstsq(design, np.sum(scaled**2, axis=1), rcond=1e-9)
     if rank < 4:
         raise ValueError("the points lie in a plane or on a line")

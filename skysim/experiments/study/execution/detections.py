@@ -19,7 +19,7 @@ from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
 from skysim.camera.render import Window
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Ints, Trajectory, taken
+from skysim.core.types import Floats, Ints, Trajectory, homogeneous, taken
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
@@ -141,7 +141,7 @@ def with_direction_noise(
     The error of the tangents, times the focal length, is added: it is that of an undistorted lens.
     """
     focal_px = scene.camera.focal_px
-    rays = np.column_stack([(xy_px - scene.camera.center_px) / focal_px, np.ones(len(xy_px))])
+    rays = homogeneous((xy_px - scene.camera.center_px) / focal_px, 1.0)
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     moved = rays + sigma_rad * lengths * rng.standard_normal(rays.shape)
     return xy_px + focal_px * (moved[:, :2] / moved[:, 2:] - rays[:, :2])
