@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
-from skysim.core.types import UP, Floats, Mount, Sources, normalized
+from skysim.core.types import UP, Floats, Mount, Sources, lengths, normalized
 from skysim.scene.sections.surroundings import (
     LinearTemperatureConfig,
     SineTemperatureConfig,
@@ -132,7 +132,7 @@ def off_center(leds: Sources, die_m: Floats) -> Sources:
     n x x: all LEDs of a batch are soldered the same way.
     """
     level = np.cross(UP, leds.normal)
-    level[np.linalg.norm(level, axis=1) < 1e-9] = (1.0, 0.0, 0.0)
+    level[lengths(level) < 1e-9] = (1.0, 0.0, 0.0)
     level = normalized(level)
     axes = np.stack([level, np.cross(leds.normal, level), leds.normal], axis=1)
     place = leds.place.copy()

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import distort, field_rad, fold_r
-from skysim.core.types import Bools, Floats, Record, frozen, grid_points
+from skysim.core.types import Bools, Floats, Record, frozen, grid_points, lengths
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.sources.stars import sky_axes
 
@@ -127,7 +127,7 @@ def fit_sip(camera: OpencvCalibration) -> Sip | None:
         round_trip = distorted(
             chip_px + monomials(chip_px / scale, powers) @ solution, camera
         )
-        worst_px = float(np.linalg.norm(round_trip - chip_px, axis=1).max())
+        worst_px = float(lengths(round_trip - chip_px).max())
         fits.append(Sip(a, b, *brown(camera), worst_px))
         # 4.
         if worst_px <= TARGET_ERROR_PX:

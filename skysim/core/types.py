@@ -19,6 +19,11 @@ Bools = NDArray[np.bool_]
 Singles = NDArray[np.float32]
 
 
+def lengths(vectors: Floats) -> Floats:
+    """(...,) lengths of (..., K) vectors."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
 def normalized(vectors: Floats) -> Floats:
     """(..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -24,7 +24,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from skysim.camera.glow.background import PointedCamera, unproject
 from skysim.camera.optics import Optics
-from skysim.core.types import UP, Floats, SourceTruth, grid_points, positive
+from skysim.core.types import UP, Floats, SourceTruth, grid_points, lengths, positive
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
 from skysim.sources.satellites import GHOST
@@ -160,7 +160,7 @@ def wall_glow(dome: ReflectingDome, camera: PointedCamera) -> Floats:
         floor_m = camera_m + meeting(few, depth_m)
         up = np.tile(UP, (len(floor_m), 1))
         met_m = camera_m + meeting(view.toward_lab, depth_m)
-        axis_m = np.linalg.norm(met_m[:, :2], axis=1)
+        axis_m = lengths(met_m[:, :2])
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)
         floor_light = spread(dome.diffuse, floor_m, up, shape)
         radiance += on_floor * dome.config.floor.share * floor_light

@@ -20,7 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import UP, Floats, Ints, Mount, Sources, homogeneous, normalized
+from skysim.core.types import (
+    UP,
+    Floats,
+    Ints,
+    Mount,
+    Sources,
+    homogeneous,
+    lengths,
+    normalized,
+)
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
@@ -433,7 +442,7 @@ def field_corners(
     lab_from_cam = lab_from_body * mount.body_from_cam
     rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)
-    length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
+    length_m = lengths(inside.meet(tip_m, rays) - tip_m)
     return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)
 
 
@@ -448,7 +457,7 @@ def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
     vertices = np.vstack([tip, corners_m])
     add_mesh(spec, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], bus, **more)
     # Edges of the pyramid: a ray to each corner, and the side to the previous corner.
-    length_m = np.linalg.norm(corners_m - tip, axis=1).min()
+    length_m = lengths(corners_m - tip).min()
     for k, corner in enumerate(corners_m):
         for kind, end in (("ray", tip), ("edge", corners_m[k - 1])):
             add_visual_geom(

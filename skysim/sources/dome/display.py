@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Ints, Sources, homogeneous, normalized
+from skysim.core.types import Bools, Floats, Ints, Sources, homogeneous, lengths, normalized
 from skysim.scene.sections import layouts, leds, light
 from skysim.scene.sections.layouts import LensDisplayConfig, ProjectorConfig
 from skysim.scene.sections.leds import LedConfig
@@ -375,7 +375,7 @@ def on_chip_m(config: LensDisplayConfig, own: Floats) -> tuple[Floats, Bools]:
 
 def undistortion(config: LensDisplayConfig, chip_m: Floats) -> Floats:
     """(N,) factors from places (N, 2) on the chip to those without distortion, by Newton's method."""
-    radius = np.linalg.norm(chip_m, axis=1) / config.focal_length_m
+    radius = lengths(chip_m) / config.focal_length_m
     tangent = radius
     for _ in range(NEWTON_STEPS if config.distortion else 0):
         excess = tangent * (1 + config.distortion * tangent**2) - radius
@@ -491,7 +491,7 @@ def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) 
     sight_m = place_m - np.array(config.position_m)
     own = own_from_lab(config).apply(sight_m)
     _, shown = on_chip_m(config, own)
-    distance_m = np.linalg.norm(sight_m, axis=1)
+    distance_m = lengths(sight_m)
     cos_axis = np.where(shown, own[:, 2] / distance_m, 1.0)
     cos_incidence = -np.sum(normal * sight_m, axis=1) / distance_m
     area_m2 = pixel_sr(config, cos_axis) * distance_m**2 / np.maximum(cos_incidence, 0)

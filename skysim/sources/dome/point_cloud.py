@@ -18,7 +18,7 @@ import scipy
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats, around_z, azimuths_rad, frozen, homogeneous
+from skysim.core.types import Floats, around_z, azimuths_rad, frozen, homogeneous, lengths
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -76,7 +76,7 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
 
     # 2.
     def residual(parameters: Floats) -> Floats:
-        return np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3]
+        return lengths(scaled - parameters[:3]) - parameters[3]
 
     start = np.append(algebraic[:3], radius)
     solution = scipy.optimize.least_squares(
@@ -105,8 +105,8 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
         # Logarithms as parameters keep the semi-axes positive.
         axes = np.exp(parameters[3:]) * sphere.radius_m
         w = (points_m - sphere.center_m - sphere.radius_m * parameters[:3]) / axes
-        norm = np.linalg.norm(w, axis=1)
-        return (norm - 1) * norm / np.linalg.norm(w / axes, axis=1)
+        norm = lengths(w)
+        return (norm - 1) * norm / lengths(w / axes)
 
     solution = scipy.optimize.least_squares(
         residual_m,
@@ -194,7 +194,7 @@ class Zernike:
         """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient."""
         # Directions beyond the cap get the radius of its edge.
         disk, stretch, log_slope = to_disk(unit, self.half_rad)
-        distance = np.maximum(np.linalg.norm(disk, axis=1), 1.0)
+        distance = np.maximum(lengths(disk), 1.0)
         value, slope = zernike(self.degree, disk / distance[:, None])
         along = np.where(distance > 1, 0.0, np.einsum("nkj,k->jn", slope, self.coefficient_m))
         gradient = np.column_stack(
@@ -313,7 +313,7 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
         ) from None
     # 2.
     relative_m = points_m - sphere.center_m
-    radius_m = np.linalg.norm(relative_m, axis=1)
+    radius_m = lengths(relative_m)
     unit = relative_m / radius_m[:, None]
     cover_rad, half_rad = covered_rad(unit)
     # 3.

@@ -24,6 +24,7 @@ from skysim.core.types import (
     Record,
     around_z,
     frozen,
+    lengths,
     normalized,
     positive,
 )
@@ -66,7 +67,7 @@ class Rim:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
         # cos(angle) >= cos(half_rad), times the distance from the bearing.
         from_bearing_m = own_m - self.bearing_m
-        slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
+        slack = SLACK_M - np.cos(self.half_rad) * lengths(from_bearing_m)
         return (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
 
 
@@ -331,7 +332,7 @@ class Radial(Surface):
 
     def within(self, own_m: Floats) -> Bools:
         """(N,) whether points are within the rim and in directions for which the radius is defined."""
-        cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
+        cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * lengths(own_m)
         return self.rim.contains(own_m) & (cosine >= -SLACK_M)
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:

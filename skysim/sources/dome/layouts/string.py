@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import UP, Floats, Ints, Sources, normalized
+from skysim.core.types import UP, Floats, Ints, Sources, lengths, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.sources.dome.layouts.placing import project_from_bearing
@@ -236,7 +236,7 @@ def lay(
 ) -> Tape:
     """A tape along (K,) directions from the bearing, with its length along the surface to each."""
     place_m = project_from_bearing(surface, directions(tilt_rad, azimuth_rad))
-    steps_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    steps_m = lengths(np.diff(place_m, axis=0))
     return Tape(tilt_rad, azimuth_rad, np.append(0, np.cumsum(steps_m)), closed)
 
 
@@ -265,7 +265,7 @@ def displace_ends(config: FibersConfig, surface: Surface, fibers: Sources) -> So
     place_m = fibers.xyz
     drawn = random_stream(seed, SHELL_STREAM).uniform(-1, 1, len(fibers))
     fraction = config.radius_variation * drawn
-    outward_m = fraction * np.linalg.norm(place_m, axis=1)
+    outward_m = fraction * lengths(place_m)
     if config.aiming is None:
         moved = place_m - outward_m[:, None] * fibers.normal
     else:
