@@ -25,7 +25,15 @@ from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
 from skysim.core.paths import DATA
 from skysim.core.time import J2000_JD
-from skysim.core.types import UP, Floats, frozen, grid_points, homogeneous, normalized
+from skysim.core.types import (
+    UP,
+    Floats,
+    frozen,
+    grid_points,
+    homogeneous,
+    lengths,
+    normalized,
+)
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -353,7 +361,7 @@ def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
         (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2
         for step in np.eye(2)
     )
-    return unproject(xy_px, optics), np.linalg.norm(np.cross(across, down), axis=1)
+    return unproject(xy_px, optics), lengths(np.cross(across, down))
 
 
 def unproject(xy_px: Floats, optics: Optics) -> Floats:

@@ -55,8 +55,7 @@ def earth_radiance(
     """
     # 1. Impact parameter, and distance to the ground or to the tangent point.
     place = observer_m * TO_SPHERE
-    along = toward * TO_SPHERE
-    along = normalized(along)
+    along = normalized(toward * TO_SPHERE)
     inward = -(along @ place)
     impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
     down = inward > 0

@@ -167,8 +167,7 @@ def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
 def perpendicular(unit: Floats) -> Floats:
     """(N, 3) one unit vector perpendicular to each of (N, 3) unit vectors; along the surface for its normals."""
     # The axis on which the vector has its least component is never parallel to it.
-    across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
-    return normalized(across)
+    return normalized(np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)]))
 
 
 def exit_distance(start: Floats, along: Floats) -> Floats:
