@@ -36,6 +36,11 @@ def around_z(radius: Any, azimuth_rad: NDArray, z: Any) -> Floats:
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
 
 
+def polar_rad(places: Floats) -> Floats:
+    """(N,) angles of (N, 3) places from +z."""
+    return np.arctan2(np.hypot(*places.T[:2]), places[:, 2])
+
+
 def azimuths_rad(places: Floats) -> Floats:
     """(N,) azimuths of (N, 3) places from +x toward +y."""
     return np.arctan2(places[:, 1], places[:, 0])

@@ -33,6 +33,7 @@ from skysim.core.types import (
     homogeneous,
     lengths,
     normalized,
+    polar_rad,
 )
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
@@ -133,7 +134,7 @@ class ViewingGeometry:
         angle w falls as cos^3: its distance grows as 1 / cos, squared, and it is inclined. With the vignetting V this
         is the cos^4 law of illumination. Distortion changes w, which is pixel_sr.
         """
-        field_rad = np.arctan2(np.hypot(*self.toward_cam.T[:2]), self.toward_cam[:, 2])
+        field_rad = polar_rad(self.toward_cam)
         throughput = self.optics.throughput(np.cos(field_rad))
         return self.optics.collecting_m2 * throughput * self.pixel_sr
 

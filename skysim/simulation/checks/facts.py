@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Record, around_z
+from skysim.core.types import Floats, Record, around_z, polar_rad
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
@@ -287,7 +287,7 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
         if np.isnan(met).any():
             return math.inf
-        zenith_rad = np.arctan2(np.hypot(*met.T[:2]), met[:, 2])
+        zenith_rad = polar_rad(met)
         needed_deg = max(needed_deg, float(np.degrees(zenith_rad).max()))
     return needed_deg
 

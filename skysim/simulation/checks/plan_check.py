@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.camera import wcs
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, polar_rad
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -363,7 +363,7 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     # 2. Greatest tilt of the fields, reduced to what most_work allows.
     place_m = plan.beliefs.lights.xyz
     most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
-    zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
+    zenith_rad = np.sort(polar_rad(place_m))
     tilt_rad = math.radians(plan.reach.attitudes.tilts_deg.max())
     if len(zenith_rad) >= most:
         tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))

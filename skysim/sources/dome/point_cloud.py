@@ -18,7 +18,15 @@ import scipy
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats, around_z, azimuths_rad, frozen, homogeneous, lengths
+from skysim.core.types import (
+    Floats,
+    around_z,
+    azimuths_rad,
+    frozen,
+    homogeneous,
+    lengths,
+    polar_rad,
+)
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -268,7 +276,7 @@ def read(file: str, unit: str) -> Floats:
 
 def covered_rad(unit: Floats) -> tuple[float, float]:
     """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
-    angle = np.arctan2(np.hypot(*unit.T[:2]), unit[:, 2])
+    angle = polar_rad(unit)
     azimuth = azimuths_rad(unit)
     sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     # Of the farthest point in each sector of azimuth, the least.
