@@ -51,7 +51,7 @@ def homogeneous(rows: Floats, last: float) -> Floats:
     return np.column_stack([rows, np.full(len(rows), last)])
 
 
-def grid_points(x: Floats, y: Floats) -> Floats:
+def grid_points(x: NDArray, y: NDArray) -> Floats:
     """(N, 2) points of a grid, row by row."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
