@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import Optics
 from skysim.core.constants import ARCSEC_RAD, HOUR_S, PPM
-from skysim.core.types import Floats, Mount, Sources, normalized
+from skysim.core.types import UP, Floats, Mount, Sources, lengths, normalized
 from skysim.scene.sections.surroundings import (
     LinearTemperatureConfig,
     SineTemperatureConfig,
@@ -23,7 +23,6 @@ from skysim.scene.sections.surroundings import (
 )
 from skysim.scene.sections.vehicle import VehicleConfig
 
-UP = np.array([0.0, 0.0, 1.0])  # of the lab, and of a level body
 BORESIGHT = UP  # in camera axes
 
 
@@ -116,7 +115,7 @@ def mount_at(vehicle: VehicleConfig, mount: Mount, lab_from_body: Rotation) -> M
     compliance_rad = ARCSEC_RAD * np.array([*vehicle.sag_arcsec, 0.0])
     turned_rad = compliance_rad * np.cross(BORESIGHT, down_cam)
     swung_m = np.cross(turned_rad, vehicle.mast_m * BORESIGHT)
-    pupil_m = mount.camera_body_m + mount.cam_from_body.inv().apply(swung_m)
+    pupil_m = mount.camera_body_m + mount.body_from_cam.apply(swung_m)
     # 2. Run-out. A level body is higher by q_z.
     deviation_m = np.array(vehicle.runout_m) * down_body
     lift_m = down_body @ deviation_m + vehicle.runout_m[2]
@@ -133,7 +132,7 @@ def off_center(leds: Sources, die_m: Floats) -> Sources:
     n x x: all LEDs of a batch are soldered the same way.
     """
     level = np.cross(UP, leds.normal)
-    level[np.linalg.norm(level, axis=1) < 1e-9] = (1.0, 0.0, 0.0)
+    level[lengths(level) < 1e-9] = (1.0, 0.0, 0.0)
     level = normalized(level)
     axes = np.stack([level, np.cross(leds.normal, level), leds.normal], axis=1)
     place = leds.place.copy()

@@ -29,7 +29,16 @@ from skysim.camera.projection import (
 )
 from skysim.camera.psf.kernel_cache import source_kernels
 from skysim.camera.render import STEP, OcclusionTest, Window, draw, render
-from skysim.core.types import Bools, Floats, Ints, Mount, Sources, SourceTruth, Trajectory
+from skysim.core.types import (
+    Bools,
+    Floats,
+    Ints,
+    Mount,
+    Sources,
+    SourceTruth,
+    Trajectory,
+    grid_points,
+)
 from skysim.sources.bodies import BodyLight
 from skysim.sources.body_discs import disc_elements, lattice_light
 from skysim.sources.dome.led import Emitter
@@ -141,7 +150,7 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
     # 1. Phases (x, y) in pixels, x fastest.
     steps = math.ceil(1 / (LATTICE * float(star.sharp_px[0])))
     phase = np.arange(steps) / steps
-    phase_px = np.stack(np.meshgrid(phase, phase), axis=-1).reshape(-1, 2)
+    phase_px = grid_points(phase, phase)
     # 2. Their directions and tracks.
     points = points_of(body, phase_px @ np.linalg.inv(disc.px_from_radius).T)
     tracks, _, _ = image_tracks(points, optics, all_poses, t_s, Emitter())
@@ -359,7 +368,7 @@ def hidden_points(
     """
     overlapping = [other for other in nearer if body.overlaps(other)]
     axis = (np.arange(COARSE) + 0.5) * (2 / COARSE) - 1
-    coarse = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    coarse = grid_points(axis, axis)
     by_vehicle = (
         occluded(points_of(body, coarse).place) if occluded else np.zeros(len(coarse), bool)
     )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.types import Floats, frozen
+from skysim.core.types import Floats, frozen, positive
 from skysim.scene.sections.camera import (
     CameraConfig,
     TwoStopsConfig,
@@ -88,7 +88,7 @@ class Optics:
         Pixel = center + f x', then scaled about the center.
         """
         # NaN in Z marks directions without an image.
-        z = np.where(vectors_cam[..., 2] > 0, vectors_cam[..., 2], np.nan)
+        z = positive(vectors_cam[..., 2])
         x = vectors_cam[..., 0] / z
         y = vectors_cam[..., 1] / z
         focal = self.camera.focal_px

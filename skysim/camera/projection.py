@@ -202,7 +202,7 @@ def beside_edges(camera: CameraConfig, xy_px: Floats) -> Floats:
     if not detector.edge_px:
         return xy_px
     from_low_px = xy_px + 0.5
-    from_high_px = np.array([camera.width_px, camera.height_px]) - from_low_px
+    from_high_px = camera.size_px - from_low_px
     reach_px = detector.edge_reach_px
     bend = np.exp(-np.abs(from_high_px) / reach_px) - np.exp(-np.abs(from_low_px) / reach_px)
     return xy_px + detector.edge_px * bend

@@ -186,7 +186,7 @@ def led_images(
     if not len(led):
         return None
     cam_from_lab, camera_m = pose
-    offset_cam = (sources.place[led, :3] - camera_m) @ cam_from_lab.T
+    offset_cam = (sources.xyz[led] - camera_m) @ cam_from_lab.T
     normal_cam = sources.normal[led] @ cam_from_lab.T
     images = disk_images(optics, emitter, offset_cam, normal_cam, sources.radius_m[led])
     if len(led) == len(sources):

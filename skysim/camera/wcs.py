@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.optics import distort, field_rad, fold_r
-from skysim.core.types import Bools, Floats, Record, frozen
+from skysim.core.types import Bools, Floats, Record, frozen, grid_points, lengths
 from skysim.scene.opencv_calibration import OpencvCalibration
 from skysim.sources.stars import sky_axes
 
@@ -127,7 +127,7 @@ def fit_sip(camera: OpencvCalibration) -> Sip | None:
         round_trip = distorted(
             chip_px + monomials(chip_px / scale, powers) @ solution, camera
         )
-        worst_px = float(np.linalg.norm(round_trip - chip_px, axis=1).max())
+        worst_px = float(lengths(round_trip - chip_px).max())
         fits.append(Sip(a, b, *brown(camera), worst_px))
         # 4.
         if worst_px <= TARGET_ERROR_PX:
@@ -160,7 +160,7 @@ def fit_grid(camera: OpencvCalibration, side: int) -> tuple[Floats, Floats, Bool
     edges = np.array([-0.5 - center, size - 0.5 - center])
     low, high = edges * np.where((edges < 0) == [[True], [False]], widening, 1 / widening)
     steps = [np.linspace(*pair, side) for pair in zip(low, high, strict=True)]
-    undistorted_px = np.stack(np.meshgrid(*steps), axis=-1).reshape(-1, 2)
+    undistorted_px = grid_points(*steps)
     distorted_px = distorted(undistorted_px, camera)
     pixels = distorted_px + center
 

@@ -19,6 +19,11 @@ Bools = NDArray[np.bool_]
 Singles = NDArray[np.float32]
 
 
+def lengths(vectors: Floats) -> Floats:
+    """(...,) lengths of (..., K) vectors."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
 def normalized(vectors: Floats) -> Floats:
     """(..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
@@ -29,6 +34,31 @@ def around_z(radius: Any, azimuth_rad: NDArray, z: Any) -> Floats:
     x = radius * np.cos(azimuth_rad)
     y = radius * np.sin(azimuth_rad)
     return np.stack(np.broadcast_arrays(x, y, z), axis=-1)
+
+
+def polar_rad(places: Floats) -> Floats:
+    """(N,) angles of (N, 3) places from +z."""
+    return np.arctan2(np.hypot(*places.T[:2]), places[:, 2])
+
+
+def azimuths_rad(places: Floats) -> Floats:
+    """(N,) azimuths of (N, 3) places from +x toward +y."""
+    return np.arctan2(places[:, 1], places[:, 0])
+
+
+def homogeneous(rows: Floats, last: float) -> Floats:
+    """(N, K + 1) rows of (N, K) numbers, and a last one that all share."""
+    return np.column_stack([rows, np.full(len(rows), last)])
+
+
+def grid_points(x: NDArray, y: NDArray) -> Floats:
+    """(N, 2) points of a grid, row by row."""
+    return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
+
+
+def positive(values: Floats) -> Floats:
+    """The values above zero, and NaN for the others."""
+    return np.where(values > 0, values, np.nan)
 
 
 Kind = TypeVar("Kind")
@@ -54,6 +84,8 @@ def taken(columns: Kind, which: Any) -> Kind:
     return table._make(column[which] for column in table)
 
 
+# Of the lab, and of a level body; in camera axes the boresight.
+UP = np.array([0.0, 0.0, 1.0])
 ROUNDING = 1e-12  # greater than the rounding error of a cosine
 
 
@@ -71,6 +103,11 @@ class Mount:
 
     camera_body_m: Floats
     cam_from_body: Rotation
+
+    @property
+    def body_from_cam(self) -> Rotation:
+        """Rotation of the camera frame into the body frame."""
+        return self.cam_from_body.inv()
 
     def toward(self, place: Floats, lab_from_body: Rotation) -> Floats:
         """(N, 3) vectors in camera axes from the pupil to places (N, 4), as in `Sources`, at an attitude."""
@@ -313,6 +350,16 @@ class Sources:
     def __len__(self) -> int:
         return len(self.id)
 
+    @property
+    def xyz(self) -> Floats:
+        """(N, 3) positions of the LEDs in m, and directions of the stars."""
+        return self.place[:, :3]
+
+    @property
+    def duty(self) -> Floats:
+        """(N,) fractions of the time for which they are lit."""
+        return np.minimum(self.on_s / self.period_s, 1.0)
+
     def take(self, which: NDArray) -> "Sources":
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
@@ -330,7 +377,7 @@ class StarSources(Sources):
     def by_z(self) -> tuple[Ints, Floats]:
         """Rows in ascending order of z, and their directions (N, 3) in this order."""
         order = np.argsort(self.place[:, 2], kind="stable")
-        return order, np.ascontiguousarray(self.place[order, :3])
+        return order, np.ascontiguousarray(self.xyz[order])
 
     def within(self, direction: Floats, angle_rad: float) -> Ints:
         """Ascending rows of the stars within an angle of a unit vector.

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 
 from skysim.core.plugins import NO_PROGRAMS, Programs
-from skysim.core.types import Floats
+from skysim.core.types import Floats, lengths
 from skysim.dynamics.attitude_control import Pid
 from skysim.dynamics.controllers import ControllerSetup, ExternalLaw, external_law
 from skysim.dynamics.guidance import Reference
@@ -58,9 +58,7 @@ def authority_nm(actuators: Actuators) -> float:
 
     A torque T of unit length in the worst direction demands max |command_from_torque T| = the greatest row norm.
     """
-    return float(
-        actuators.limit / np.linalg.norm(actuators.command_from_torque, axis=1).max()
-    )
+    return float(actuators.limit / lengths(actuators.command_from_torque).max())
 
 
 def usage(actuators: Actuators, torque_nm: Floats) -> Floats:

@@ -11,7 +11,7 @@ images.
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -38,8 +38,7 @@ RISE_FRACTION = 0.1
 MAX_RISE_S = 1.0
 
 
-@frozen
-class Sines:
+class Sines(NamedTuple):
     """A rotation vector in body axes: phi(t) = sum_k sine_k sin(omega_k t) + cosine_k cos(omega_k t).
 
     Attributes
@@ -154,9 +153,7 @@ class VibrationComponent:
 
     def evaluate(self, t_s: Floats) -> tuple[Floats, Floats]:
         """(N, 3) phi and (N, 3) its derivative at (N,) times within the interval."""
-        phi, rate = evaluate_sines(
-            t_s, self.sines.omega_rad_s, self.sines.sine_rad, self.sines.cosine_rad
-        )
+        phi, rate = evaluate_sines(t_s, *self.sines)
         if not math.isfinite(self.begin_s):
             return phi, rate
         # Product rule.

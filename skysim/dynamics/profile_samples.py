@@ -23,7 +23,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError, Where, printable
 from skysim.core.text import Line, cells_of, excerpt, seconds_since, to_numbers
 from skysim.core.time import J2000_JD
-from skysim.core.types import Floats, Ints, Record, frozen
+from skysim.core.types import Floats, Ints, Record, frozen, lengths
 from skysim.scene.sections.motion import RotationName
 from skysim.sources.stars import cam_from_icrs
 
@@ -103,7 +103,7 @@ def from_quaternions(
 ) -> Samples:
     """Samples of quaternions (N, 4), scalar last. Raises InputError for the first one whose norm is not 1."""
     places = np.asarray(places, np.int64)
-    norm = np.linalg.norm(xyzw, axis=1) if len(xyzw) else np.empty(0)
+    norm = lengths(xyzw) if len(xyzw) else np.empty(0)
     bad = np.flatnonzero(~(np.abs(norm - 1) <= UNIT_TOLERANCE))  # NaN is bad, too
     if len(bad):
         raise Where(source, int(places[bad[0]]), unit).error(

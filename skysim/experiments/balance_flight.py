@@ -438,7 +438,7 @@ def measured_attitudes(
     The covariances (3, 3, 3) are the whole one, the part that frames share, and the part of this that is constant.
     """
     camera = flight.lab.camera
-    body_from_cam = camera.mount.cam_from_body.inv()
+    body_from_cam = camera.mount.body_from_cam
     R_body_from_cam = body_from_cam.as_matrix()
     rows = []
     for shot in flight.shots(cameras=[0], progress=watch):

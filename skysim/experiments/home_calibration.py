@@ -42,7 +42,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import Floats, Ints, Record, normalized
+from skysim.core.types import UP, Floats, Ints, Record, normalized
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
 from skysim.experiments.dome_survey.survey_procedure import (
     ATTITUDES,
@@ -314,7 +314,7 @@ def scaled(known: CalibrationPrior, first: Sighting, clicks: int) -> Camera:
         raise InputError("clicks", f"{len(clicked)} LEDs in the first frame", "2 or more")
     transform = estimate_transform("similarity", first.xy_px[clicked], place_m[clicked])
     # The first frame is taken at home, with the board before the camera at the distance R - M.
-    _, distance_m = thesis_points(np.array([[0.0, 0.0, 1.0]]), known.leds, known.lever)
+    _, distance_m = thesis_points(UP[None], known.leds, known.lever)
     return replace(known.camera, focal_px=float(distance_m / transform.scale))
 
 

@@ -297,6 +297,6 @@ def on_detector(points: Sources, exposure: Exposure) -> tuple[Ints, list[Floats]
     projected = [one[0] for one in project(points.take(near), optics, exposure.pose)]
     xy_px = projected[0]
     # The detector ends half a pixel outside of the centers of its outer pixels.
-    size = np.array([optics.camera.width_px, optics.camera.height_px])
+    size = np.array(optics.camera.size_px)
     on_chip = ((xy_px > -0.5) & (xy_px < size - 0.5)).all(axis=1)
     return near[on_chip], [one[on_chip] for one in projected]

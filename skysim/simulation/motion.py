@@ -286,7 +286,7 @@ def mounting_rad(camera: StarCamera, t_s: Floats) -> Floats:
     turned = [
         (as_built.turned(config, t) if config else Rotation.identity()) * error for t in t_s
     ]
-    return -camera.mount.cam_from_body.inv().apply(Rotation.concatenate(turned).as_rotvec())
+    return -camera.mount.body_from_cam.apply(Rotation.concatenate(turned).as_rotvec())
 
 
 # The motion.

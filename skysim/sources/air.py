@@ -271,7 +271,7 @@ class Sky:
         row = self.air.rows(lights.id)
         b_v = self.air.b_v[row]
         directions = self.air.refraction.apparent(
-            lights.place[:, :3], self.zenith, self.air.dispersion[row]
+            lights.xyz, self.zenith, self.air.dispersion[row]
         )
         passed = transmission(self.air_mass(directions), self.air.extinction_mag(b_v))
         place = np.column_stack([directions, lights.place[:, 3]])
@@ -284,7 +284,7 @@ class Sky:
 
         Each star's light is multiplied by a random factor of mean 1.
         """
-        air_masses = self.air_mass(seen.place[:, :3])
+        air_masses = self.air_mass(seen.xyz)
         optics = aperture_m, exposure_s, self.air.site.height_m, self.air.wavelength_m
         variances = variance(air_masses, *optics)
         return replace(seen, strength=seen.strength * factors(variances, rng))

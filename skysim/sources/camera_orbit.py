@@ -22,7 +22,7 @@ from skysim.core.constants import (
 )
 from skysim.core.errors import InputError
 from skysim.core.time import tt_jd
-from skysim.core.types import Bools, Floats, Ints, frozen, joined, normalized, taken
+from skysim.core.types import Bools, Floats, Ints, frozen, joined, lengths, normalized, taken
 from skysim.scene.sections.surroundings import (
     CircularOrbitConfig,
     ExclusionConfig,
@@ -228,7 +228,7 @@ def hidden_by_earth(
     """
     place = observer_m * TO_SPHERE
     along = direction * TO_SPHERE
-    length = np.linalg.norm(along, axis=-1)
+    length = lengths(along)
     # Nearest point of the line to the center, and the center's distance squared.
     inward = -(along @ place if place.ndim == 1 else np.sum(along * place, axis=-1)) / length
     square = np.sum(place * place, axis=-1)
@@ -250,7 +250,7 @@ def sunlit_fraction(place_m: Floats, sun_m: Floats) -> Floats:
     to_sun = sun_m - place_m
     # Elevation above the limb in units of the Sun's angular radius.
     h_rad = limb_elevation_rad(place_m, to_sun)
-    h = np.clip(h_rad * np.linalg.norm(to_sun, axis=-1) / SUN_RADIUS_M, -1, 1)
+    h = np.clip(h_rad * lengths(to_sun) / SUN_RADIUS_M, -1, 1)
     return 0.5 + (h * np.sqrt(1 - h**2) + np.arcsin(h)) / np.pi
 
 
@@ -261,8 +261,8 @@ def limb_elevation_rad(place_m: Floats, direction: Floats) -> Floats:
     """
     place = place_m * TO_SPHERE
     toward = direction * TO_SPHERE
-    radius = np.linalg.norm(place, axis=-1)
-    length = np.linalg.norm(toward, axis=-1)
+    radius = lengths(place)
+    length = lengths(toward)
     # Elevation above the plane across the vertical, then the dip of the limb.
     above_horizon = np.arcsin(
         np.clip(np.sum(place * toward, axis=-1) / (radius * length), -1, 1)

@@ -19,7 +19,7 @@ from skysim.core.constants import (
     STANDARD_TEMPERATURE_K,
     ZERO_CELSIUS_K,
 )
-from skysim.core.types import Floats, frozen
+from skysim.core.types import Floats, frozen, lengths
 
 # The model's own numbers (Hohenkerk & Sinclair 1985): gas constant, molar masses, radius and lapse rate.
 GAS_J_KMOL_K = 8314.32
@@ -237,7 +237,7 @@ class Refraction:
         """
         cosine = directions @ zenith
         across = zenith - cosine[:, None] * directions
-        sine = np.linalg.norm(across, axis=1)
+        sine = lengths(across)
         zenith_rad = np.arctan2(sine, cosine)
         bending = scale * self.bending_rad(
             zenith_rad - (scale - 1) / 2 * self.bending_rad(zenith_rad)

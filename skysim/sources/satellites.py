@@ -17,7 +17,7 @@ import numpy as np
 from skysim.core.constants import SPEED_OF_LIGHT_M_S
 from skysim.core.random_streams import SATELLITES, random_stream
 from skysim.core.time import tt_jd
-from skysim.core.types import Floats, Ints, SatelliteTruth, Sources, normalized
+from skysim.core.types import Floats, Ints, SatelliteTruth, Sources, lengths, normalized
 from skysim.scene.sections.surroundings import RandomSatellitesConfig
 from skysim.sources.bodies import NAMES, WHITE, reflected_chromatic, reflected_flux_e_s_m2
 from skysim.sources.camera_orbit import (
@@ -106,15 +106,15 @@ def known_satellites(
     here = observer_at(0.0)
     sun = sun_m(tt_jd(time))
     states = gcrs_states(elements, time, np.zeros(1))
-    far = np.linalg.norm(states[0][:, 0] - here.position_m, axis=1) > OWN_M
+    far = lengths(states[0][:, 0] - here.position_m) > OWN_M
     others = np.flatnonzero((states[2][:, 0] == 0) & far)
     place_m = states[0][others, 0]
     velocity_m_s = states[1][others, 0]
     to_m = place_m - here.position_m
-    range_m = np.linalg.norm(to_m, axis=1)
+    range_m = lengths(to_m)
     # Field, and half of what camera and satellite turn during the exposure.
     across = np.cross(to_m / range_m[:, None], velocity_m_s - here.velocity_m_s)
-    rate_rad_s = np.linalg.norm(across, axis=1) / range_m
+    rate_rad_s = lengths(across) / range_m
     turn_rad = view.turn_rad + rate_rad_s * view.duration_s
     reach_rad = view.field_rad + MARGIN_RAD + turn_rad / 2
     near = to_m @ view.boresight > np.cos(np.minimum(reach_rad, np.pi)) * range_m
@@ -155,7 +155,7 @@ def path(
     delay_s = np.zeros(3)
     for _ in range(3):
         to_m = gcrs_states([one], time, after_s - delay_s)[0][0] - from_m
-        delay_s = np.linalg.norm(to_m, axis=1) / SPEED_OF_LIGHT_M_S
+        delay_s = lengths(to_m) / SPEED_OF_LIGHT_M_S
     range_m = np.linalg.norm(to_m, axis=1, keepdims=True)
     # 3. Aberration; lengths keep the ratios of the ranges, so that the path is that of a place in space.
     own_m_s = np.array([state.velocity_m_s for state in states])

@@ -16,7 +16,7 @@ from skysim.core.constants import (
 )
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.time import J2000_JD, tt_days
-from skysim.core.types import Floats, Ints, Sources, StarSources, normalized
+from skysim.core.types import Floats, Ints, Sources, StarSources, homogeneous, normalized
 from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
 
@@ -159,9 +159,8 @@ def steady_points(
     ones = np.ones(count)
     return StarSources(
         id=ids,
-        place=np.ascontiguousarray(
-            np.column_stack([direction, zeros])
-        ),  # contiguous: rows are taken from it
+        # Contiguous: rows are taken from it.
+        place=np.ascontiguousarray(homogeneous(direction, 0.0)),
         normal=np.zeros((count, 3)),
         radius_m=zeros,
         strength=flux_e_s_m2,

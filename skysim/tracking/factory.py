@@ -217,6 +217,7 @@ STAR_ALGORITHMS: dict[str, Mapping[str, object]] = {
     "identifier": IDENTIFIERS,
     "solver": SOLVERS,
 }
+NEAR_ALGORITHMS = STAR_ALGORITHMS | {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
 
 
 def assumed_settings(scene: Scene) -> Settings:
@@ -257,10 +258,7 @@ def assumed_settings(scene: Scene) -> Settings:
 
 def algorithm_tables(scene: Scene) -> dict[str, Mapping[str, object]]:
     """The algorithms that a scene's tracker may use: by stage, then by name."""
-    near: dict[str, Mapping[str, object]] = {}
-    if scene.dome:
-        near = {"identifier": NEAR_IDENTIFIERS, "solver": NEAR_SOLVERS}
-    return STAR_ALGORITHMS | near
+    return NEAR_ALGORITHMS if scene.dome else STAR_ALGORITHMS
 
 
 def algorithm_names(scene: Scene) -> dict[str, tuple[str, ...]]:

@@ -122,7 +122,7 @@ class Navigation:
         self.imu = imu.Imu(config, rng)
         self.position_body_m = position_body_m
         self.gravity_m_s2 = gravity_m_s2
-        self.body_from_cam = [mount.cam_from_body.inv() for mount in mounts]
+        self.body_from_cam = [mount.body_from_cam for mount in mounts]
         self.step_s = 1 / config.rate_hz
         self.samples = 0
         earth = imu.earth_rate_lab_rad_s(scene.site)

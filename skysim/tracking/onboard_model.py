@@ -23,7 +23,7 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints, Mount, Sources
+from skysim.core.types import UP, Floats, Ints, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
@@ -47,11 +47,11 @@ def assumed_dome(scene: Scene, light: DomeConfig, sources: Sources) -> LedMap:
     """
     inside = surface.build_surface(light.surface)
     survey = scene.tracker.survey
-    position_m = survey_errors.assumed_leds_m(inside, sources.place[:, :3], survey)
+    position_m = survey_errors.assumed_leds_m(inside, sources.xyz, survey)
     board = registry.board_of(light.layout, sources.id)
     ellipsoid = survey_errors.assumed_ellipsoid(inside, survey)
-    covariance_m2 = survey_errors.led_covariance_m2(sources.place[:, :3], survey)
-    common_m = survey_errors.common_displacements_m(inside, sources.place[:, :3], survey)
+    covariance_m2 = survey_errors.led_covariance_m2(sources.xyz, survey)
+    common_m = survey_errors.common_displacements_m(inside, sources.xyz, survey)
     sigma_m = float(survey.led_sigma_m)
     if covariance_m2 is not None:
         sigma_m = float(survey_errors.across_sigma_m(position_m, covariance_m2).max())
@@ -70,7 +70,7 @@ def with_brightness(scene: Scene, light: DomeConfig, leds: LedMap, lever: Lever)
     )
     nominal = nominal.take(rows_of(leds.id, nominal.id))
     distance_m = leds.radius_m - np.linalg.norm(lever.camera_body_m)
-    strength = nominal.strength * np.minimum(nominal.on_s / nominal.period_s, 1.0)
+    strength = nominal.strength * nominal.duty
     light_e_s_m2 = irradiance_e_s_m2(
         strength, Emitter.from_config(light.led), np.ones(1), np.ones(1), distance_m
     )
@@ -165,7 +165,7 @@ def surveyed_dome(
     """
     # 1. The file is of this camera and of LEDs of this dome.
     dome_map = dome_map_file.read_dome_map(Path(path))
-    size_px = (scene.camera.width_px, scene.camera.height_px)
+    size_px = scene.camera.size_px
     if dome_map.size_px != size_px:
         raise InputError(
             "tracker.map",
@@ -296,7 +296,7 @@ class OrbitStarTracker(StarTracker):
         """The attitude of a frame at a time since the start, corrected by the rotation b x dv / c."""
         if attitude.cam_from_ref is None:
             return attitude
-        boresight = attitude.cam_from_ref.inv().apply([0.0, 0.0, 1.0])
+        boresight = attitude.cam_from_ref.inv().apply(UP)
         changed_m_s = state_at(self.orbit, t_s).velocity_m_s - self.start_m_s
         changed = changed_m_s / catalog.SPEED_OF_LIGHT_M_S
         now_from_start = Rotation.from_rotvec(np.cross(boresight, changed))

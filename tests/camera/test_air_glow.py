@@ -140,7 +140,8 @@ def glow_toward(lab: Lab, cam_from_lab: Rotation) -> Floats:
     air_glow = find_light(lab.camera.lights, AirGlow)
     assert air_glow is not None
     lab_from_body = cam_from_lab.inv() * lab.camera.mount.cam_from_body
-    return air_glow.glow(expected_exposure(lab.camera, lab_from_body, np.zeros(3), 0.0))
+    exposure = expected_exposure(lab.camera, lab_from_body, np.zeros(3), 0.0)
+    return air_glow.during(exposure).glow()
 
 
 def up_pointing(lab: Lab) -> Rotation:

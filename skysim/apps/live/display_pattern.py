@@ -187,7 +187,7 @@ def lights_of(lits: Iterable[Lit], exposure: Exposure) -> tuple[Floats, Floats]:
         hidden = lit.occlusion
         for sources in filter(None, (lit.points, centers_of(lit.discs))):
             seen = sources.take(~hidden(sources.place)) if hidden else sources
-            offset_m = seen.place[:, :3] - seen.place[:, 3:] * exposure.camera_m
+            offset_m = seen.xyz - seen.place[:, 3:] * exposure.camera_m
             distance_m = np.linalg.norm(offset_m, axis=1)
             direction = offset_m / distance_m[:, None]
             cos_out = -np.sum(direction * seen.normal, axis=1)

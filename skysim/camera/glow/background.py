@@ -25,7 +25,16 @@ from skysim.camera.optics import Optics, tangential
 from skysim.core.jit import jit
 from skysim.core.paths import DATA
 from skysim.core.time import J2000_JD
-from skysim.core.types import Floats, frozen, normalized
+from skysim.core.types import (
+    UP,
+    Floats,
+    frozen,
+    grid_points,
+    homogeneous,
+    lengths,
+    normalized,
+    polar_rad,
+)
 from skysim.scene.sections.camera import CameraConfig, radial
 from skysim.scene.sections.surroundings import (
     FaintStarsGlowConfig,
@@ -125,7 +134,7 @@ class ViewingGeometry:
         angle w falls as cos^3: its distance grows as 1 / cos, squared, and it is inclined. With the vignetting V this
         is the cos^4 law of illumination. Distortion changes w, which is pixel_sr.
         """
-        field_rad = np.arctan2(np.hypot(*self.toward_cam.T[:2]), self.toward_cam[:, 2])
+        field_rad = polar_rad(self.toward_cam)
         throughput = self.optics.throughput(np.cos(field_rad))
         return self.optics.collecting_m2 * throughput * self.pixel_sr
 
@@ -148,8 +157,7 @@ class PointedCamera(NamedTuple):
         camera = self.optics.camera
         smooth_px = min(MAX_NODE_SPACING_PX, max(MAX_NODE_SPACING_RAD * camera.focal_px, 1.0))
         spacing = spacing_px or smooth_px
-        size_px = camera.width_px, camera.height_px
-        return self.grid(*(math.ceil((size - 1) / spacing) + 1 for size in size_px))
+        return self.grid(*(math.ceil((size - 1) / spacing) + 1 for size in camera.size_px))
 
     def grid(self, columns: int, rows: int) -> ViewingGeometry:
         """The geometry of nodes that are evenly spread from corner to corner, row by row."""
@@ -158,7 +166,7 @@ class PointedCamera(NamedTuple):
         return ViewingGeometry(
             toward_cam=toward,
             toward_lab=lab_from_cam.apply(toward),
-            boresight_lab=lab_from_cam.apply([0.0, 0.0, 1.0]),
+            boresight_lab=lab_from_cam.apply(UP),
             pixel_sr=pixel_sr,
             shape=(rows, columns),
             optics=self.optics,
@@ -342,8 +350,7 @@ def even_grid_px(camera: CameraConfig, columns: int, rows: int) -> Floats:
     """(rows * columns, 2) pixel positions, evenly spread from corner to corner, row by row."""
     across = np.linspace(0, camera.width_px - 1, columns)
     down = np.linspace(0, camera.height_px - 1, rows)
-    x, y = np.meshgrid(across, down)
-    return np.column_stack([x.ravel(), y.ravel()])
+    return grid_points(across, down)
 
 
 def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
@@ -355,7 +362,7 @@ def pixel_directions(xy_px: Floats, optics: Optics) -> tuple[Floats, Floats]:
         (unproject(xy_px + step, optics) - unproject(xy_px - step, optics)) / 2
         for step in np.eye(2)
     )
-    return unproject(xy_px, optics), np.linalg.norm(np.cross(across, down), axis=1)
+    return unproject(xy_px, optics), lengths(np.cross(across, down))
 
 
 def unproject(xy_px: Floats, optics: Optics) -> Floats:
@@ -383,8 +390,7 @@ def unproject(xy_px: Floats, optics: Optics) -> Floats:
             plane = centered * (undistorted_r / np.maximum(distorted_r, 1e-300))[:, None]
             decentering = np.column_stack(tangential(camera.distortion, *plane.T))
     # 3.
-    toward = np.column_stack([plane, np.ones(len(plane))])
-    return normalized(toward)
+    return normalized(homogeneous(plane, 1.0))
 
 
 def fill(image: NDArray, coarse: Floats, factor: float) -> None:

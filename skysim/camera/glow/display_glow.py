@@ -41,7 +41,7 @@ def black_glow(
     if not isinstance(screen, layouts.PixelsConfig) or not screen.contrast:
         return None
     optics, _, camera_m, band = pointed
-    size_px = optics.camera.width_px, optics.camera.height_px
+    size_px = optics.camera.size_px
     projected = isinstance(screen, layouts.ProjectorConfig)
     counts = [size // NODE_SPACING_PX + 2 for size in size_px] if projected else size_px
     view = pointed.grid(*counts)

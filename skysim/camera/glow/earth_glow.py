@@ -23,7 +23,7 @@ from skysim.camera.glow.background import (
     transmittance,
 )
 from skysim.core.constants import EARTH_RADIUS_M, SUN_V_MAG
-from skysim.core.types import Floats, normalized
+from skysim.core.types import UP, Floats, normalized
 from skysim.scene.sections.camera import BaffleConfig
 from skysim.scene.sections.surroundings import AirGlowConfig, EarthConfig
 from skysim.sources.air import Sky, air_mass
@@ -55,8 +55,7 @@ def earth_radiance(
     """
     # 1. Impact parameter, and distance to the ground or to the tangent point.
     place = observer_m * TO_SPHERE
-    along = toward * TO_SPHERE
-    along = normalized(along)
+    along = normalized(toward * TO_SPHERE)
     inward = -(along @ place)
     impact = np.sqrt(np.maximum(place @ place - inward**2, 0.0))
     down = inward > 0
@@ -85,7 +84,7 @@ def earth_light(
 ) -> Floats | None:
     """(h, w) electrons s^-1 px^-1 of the Earth at nodes for `background.fill`; None if it is not in the field."""
     # The angle between boresight and nadir, and the angular radius of Earth and airglow.
-    boresight = camera.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+    boresight = camera.cam_from_lab.inv().apply(UP)
     distance_m = float(np.linalg.norm(observer_m))
     cosine = float(-boresight @ observer_m) / distance_m
     from_nadir_rad = math.acos(max(min(cosine, 1.0), -1.0))
@@ -200,7 +199,7 @@ NEAREST_DEG = 0.25
 
 
 def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
-    """(M,) electrons per second and pixel of the sky's glow, with the Sun's color; 0 below the skyline."""
+    """(h, w) electrons per second and pixel of the sky's glow, with the Sun's color; 0 below the skyline."""
     zenith_rad = math.pi / 2 - sky.altitude_rad(view.toward_lab)
     extinction_mag = sky.air.config.extinction_mag
     above = ~sky.below_horizon(view.toward_lab)
@@ -216,7 +215,7 @@ def air_glow(config: AirGlowConfig, sky: Sky, view: ViewingGeometry) -> Floats:
             np.degrees(zenith_rad),
             extinction_mag,
         )
-    return nanolamberts_e_s(nanolamberts, view) * above
+    return (nanolamberts_e_s(nanolamberts, view) * above).reshape(view.shape)
 
 
 def seen_place(name: str, sky: Sky) -> Place:

@@ -24,7 +24,7 @@ from scipy.interpolate import RectBivariateSpline
 
 from skysim.camera.glow.background import PointedCamera, unproject
 from skysim.camera.optics import Optics
-from skysim.core.types import Floats, SourceTruth
+from skysim.core.types import UP, Floats, SourceTruth, grid_points, lengths, positive
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
 from skysim.sources.satellites import GHOST
@@ -158,9 +158,9 @@ def wall_glow(dome: ReflectingDome, camera: PointedCamera) -> Floats:
     if dome.config.floor:
         depth_m = camera_m[2] + dome.config.floor.depth_m
         floor_m = camera_m + meeting(few, depth_m)
-        up = np.tile([0.0, 0.0, 1.0], (len(floor_m), 1))
+        up = np.tile(UP, (len(floor_m), 1))
         met_m = camera_m + meeting(view.toward_lab, depth_m)
-        axis_m = np.linalg.norm(met_m[:, :2], axis=1)
+        axis_m = lengths(met_m[:, :2])
         on_floor = ~seen & (axis_m < dome.config.floor.radius_m)
         floor_light = spread(dome.diffuse, floor_m, up, shape)
         radiance += on_floor * dome.config.floor.share * floor_light
@@ -169,7 +169,7 @@ def wall_glow(dome: ReflectingDome, camera: PointedCamera) -> Floats:
 
 def meeting(toward: Floats, depth_m: float) -> Floats:
     """(N, 3) offsets along unit vectors to a level plane depth_m below; NaN for vectors that do not point down."""
-    return toward * (depth_m / np.where(toward[:, 2] < 0, -toward[:, 2], np.nan))[:, None]
+    return toward * (depth_m / positive(-toward[:, 2]))[:, None]
 
 
 def spread(
@@ -190,5 +190,4 @@ def chip_grid(optics: Optics, shape: tuple[int, int], margin: float) -> Floats:
         np.linspace(-margin * size, (1 + margin) * size, count) - 0.5
         for size, count in zip((camera.height_px, camera.width_px), shape, strict=True)
     )
-    x, y = np.meshgrid(columns, rows)
-    return unproject(np.column_stack([x.ravel(), y.ravel()]), optics).reshape(*shape, 3)
+    return unproject(grid_points(columns, rows), optics).reshape(*shape, 3)

@@ -5,6 +5,7 @@ defocus disk) are the key of a kernel in the camera's cache. Disks that are visi
 in each exposure (psf/ellipse.py); they share the tables of their box.
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -75,7 +76,11 @@ class Kernels(NamedTuple):
     parts: Floats
 
 
-class KernelCache(NamedTuple):
+NO_TABLE = np.empty(0, np.float32)
+
+
+@dataclass
+class KernelCache:
     """A camera's kernels, their tables laid end to end in the order of first use.
 
     Attributes
@@ -83,11 +88,11 @@ class KernelCache(NamedTuple):
     kernels
         Kind, sigma_px, reach_px and sharp_px of each key's kernel, and its row of `Kernels.table`
     tables
-        One element: all tables joined
+        All tables joined
     """
 
     kernels: dict[tuple[int, ...], tuple[float, ...]]
-    tables: list[Singles]
+    tables: Singles
 
 
 CACHE_BYTES = 1 << 27  # the cache is emptied when it is larger than this
@@ -99,23 +104,7 @@ COMA_PX = 0.1  # step of coma along x and y
 @lru_cache(maxsize=16)
 def kernel_cache(camera: CameraConfig) -> KernelCache:
     """The kernel cache of a camera, empty at first."""
-    return KernelCache({}, [np.empty(0, np.float32)])
-
-
-class SourceSizes(NamedTuple):
-    """Sizes of N images, px: (N,) each.
-
-    Attributes
-    ----------
-    sigma_px
-        Standard deviations of the Gaussian blurs in addition to the lens's
-    emitter_px, defocus_px
-        Radii of the emitters' disks and of the defocus disks; 0 for sources far outside the frame
-    """
-
-    sigma_px: Floats
-    emitter_px: Floats
-    defocus_px: Floats
+    return KernelCache({}, NO_TABLE)
 
 
 def source_kernels(
@@ -166,18 +155,15 @@ def source_kernels(
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
     defocus = blur_radius_px(camera, axial_m, chromatic[:, 0])
-    size = np.array([camera.width_px, camera.height_px])
-    outside_px = np.maximum(np.maximum(-position, position - size), 0).max(axis=1)
+    outside_px = np.maximum(np.maximum(-position, position - camera.size_px), 0).max(axis=1)
     # Sources far outside the frame have no image.
-    near = outside_px < MAX_RADIUS_PX
-    sizes = SourceSizes(sigma, np.where(near, emitter, 0.0), np.where(near, defocus, 0.0))
-    axes_px = np.column_stack([sizes.emitter_px] * 2)
-    if disks is not None:
-        axes_px = disks.semi_axes_px()
-    check_radii(sizes, axes_px)
-    keys = np.rint(np.column_stack(sizes) / QUANTUM_PX).astype(np.int64)
+    near = (outside_px < MAX_RADIUS_PX)[:, None]
+    radii_px = np.where(near, np.column_stack([emitter, defocus]), 0.0)
+    axes_px = radii_px[:, [0, 0]] if disks is None else disks.semi_axes_px()
+    check_radii(radii_px, axes_px)
+    keys = np.rint(np.column_stack([sigma, radii_px]) / QUANTUM_PX).astype(np.int64)
     # 2. Ellipses.
-    disk = ellipses(keys, camera, disks, axes_px, sizes)
+    disk = ellipses(keys, camera, disks, axes_px, sigma, *radii_px.T)
     # 3. Gaussians need no shared table, so all have the key of sharp points.
     coma_px = camera.along_radius("coma_um", camera.psf.coma_px, position)
     gaussian = camera.psf.kind == "gaussian" and not (
@@ -194,19 +180,19 @@ def source_kernels(
     kernels = look_up(camera, keys, disk, parts)
     # 4. Widening.
     if gaussian and sigma.any():
-        kernels = widened(kernels, sizes.sigma_px)
+        kernels = widened(kernels, sigma)
     return kernels
 
 
-def check_radii(sizes: SourceSizes, axes_px: Floats) -> None:
+def check_radii(radii_px: Floats, axes_px: Floats) -> None:
     """Raise InputError for an image, of a disk with semi-axes axes_px (N, 2), larger than MAX_RADIUS_PX."""
-    emitter = sizes.emitter_px
-    widest = np.where(emitter > 0, np.fmax(emitter, axes_px[:, 0]), 0)
-    largest = (widest + sizes.defocus_px).max(initial=0.0)
+    emitter_px, defocus_px = radii_px.T
+    widest = np.where(emitter_px > 0, np.fmax(emitter_px, axes_px[:, 0]), 0)
+    largest = (widest + defocus_px).max(initial=0.0)
     if largest > MAX_RADIUS_PX:
         raise InputError(
             "camera.focus",
-            f"a source's image, {sizes.defocus_px.max():.0f} px out of focus, has a radius of {largest:.0f} px",
+            f"a source's image, {defocus_px.max():.0f} px out of focus, has a radius of {largest:.0f} px",
             f"up to {MAX_RADIUS_PX:.0f} px",
         )
 
@@ -216,16 +202,23 @@ def ellipses(
     camera: CameraConfig,
     disks: DiskImages | None,
     axes_px: Floats,
-    sizes: SourceSizes,
+    sigma: Floats,
+    emitter: Floats,
+    defocus: Floats,
 ) -> Floats:
     """(N, 15) fields of `ellipse.EllipseDisk` of the disks that a circle does not represent, zeros for others.
 
     Their rows of `keys` become the keys of their boxes.
+
+    Parameters
+    ----------
+    sigma, emitter, defocus
+        (N,) standard deviations of the Gaussian blurs in addition to the lens's, radii of the emitters' disks and of
+        the defocus disks, px
     """
     disk = np.zeros((len(keys), len(ellipse.EllipseDisk._fields)))
     if disks is None:
         return disk
-    sigma, emitter, defocus = sizes
     # A Gaussian of this variance has the peak of a point's image: sum of lens, blur and defocus disk.
     lens_px2 = 1 / (2 * np.pi * build_kernel(camera.psf, camera).peak)
     variance_px2 = lens_px2 + sigma**2 + defocus**2 / 4
@@ -254,14 +247,14 @@ def look_up(camera: CameraConfig, keys: Ints, disk: Floats, parts: Floats) -> Ke
     reach += np.abs(parts[..., 1:]).max((1, 2))
     spans = properties[:, 4:].astype(np.int64)
     # The Bessel table takes a while to build.
-    bessel = ellipse.jinc_table() if disk.any() else np.empty(0, np.float32)
+    bessel = ellipse.jinc_table() if disk.any() else NO_TABLE
     return Kernels(
         kind.astype(np.int64),
         sigma,
         reach,
         sharp,
         spans,
-        cache.tables[0],
+        cache.tables,
         disk,
         bessel,
         parts,
@@ -372,12 +365,11 @@ def add_kernels(
     InputError
         For kernels that take more than twice CACHE_BYTES.
     """
-    if cache.tables[0].nbytes > CACHE_BYTES:
-        for container in cache:
-            container.clear()
-        cache.tables.append(np.empty(0, np.float32))
-    tables = [cache.tables[0]]
-    begin = len(cache.tables[0])
+    if cache.tables.nbytes > CACHE_BYTES:
+        cache.kernels.clear()
+        cache.tables = NO_TABLE
+    tables = [cache.tables]
+    begin = len(cache.tables)
     # Each missing key once, in order.
     for key in dict.fromkeys(key for key in keys if key not in cache.kernels):
         properties, sizes, table = make_kernel(camera, key)
@@ -391,7 +383,7 @@ def add_kernels(
                 "a smaller table, or corner_sigma_px: 0",
             )
     if len(tables) > 1:
-        cache.tables[0] = np.concatenate(tables)
+        cache.tables = np.concatenate(tables)
 
 
 def make_kernel(

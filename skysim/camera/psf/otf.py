@@ -18,7 +18,7 @@ from scipy import special
 
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats
+from skysim.core.types import Floats, lengths
 from skysim.core.yaml_reader import is_file
 from skysim.scene.sections.camera import (
     AiryPsfConfig,
@@ -60,9 +60,7 @@ def blur_radius_px(camera: CameraConfig, distance_m: Any, focus_shift_m: Any = 0
 
 def field_sigma_px(camera: CameraConfig, xy_px: Floats) -> Floats:
     """(...,) sigma of the field's blur at pixels (..., 2): psf.corner_sigma_px at the farthest corner, or a table's."""
-    return np.linalg.norm(
-        camera.along_radius("sigma_um", camera.psf.corner_sigma_px, xy_px), axis=-1
-    )
+    return lengths(camera.along_radius("sigma_um", camera.psf.corner_sigma_px, xy_px))
 
 
 def chromatic_sigma_px(camera: CameraConfig, chromatic: Floats) -> Floats:

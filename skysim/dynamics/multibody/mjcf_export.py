@@ -20,7 +20,16 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
-from skysim.core.types import Floats, Ints, Mount, Sources, normalized
+from skysim.core.types import (
+    UP,
+    Floats,
+    Ints,
+    Mount,
+    Sources,
+    homogeneous,
+    lengths,
+    normalized,
+)
 from skysim.dynamics.multibody.integrator import Simulation
 from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
@@ -104,7 +113,7 @@ def mjcf(
         add_dome(spec, rings_m)
         look_at(spec, *dome_view(rings_m))
     else:
-        boresight = lab_from_body.apply(mount.cam_from_body.inv().apply([0.0, 0.0, 1.0]))
+        boresight = lab_from_body.apply(mount.body_from_cam.apply(UP))
         look_at(spec, *sky_view(vehicle, boresight))
     # 3. Lights, field of view, keyframe.
     add_lights(spec, sources)
@@ -280,7 +289,7 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
     azimuth = np.linspace(0, 2 * np.pi, SECTORS, endpoint=False)
     # 1. Panel: circles about its center, clipped to its edges.
     if isinstance(inside, Plane):
-        outer_m = inside.height_m * np.tan(min(cap_rad + 0.1, 1.3))
+        outer_m = inside.center_m[2] * np.tan(min(cap_rad + 0.1, 1.3))
         radius_m = np.linspace(1e-3, outer_m, RINGS)[:, None, None]
         half_m = np.append(inside.half_m, np.inf)
         around = np.stack([np.cos(azimuth), np.sin(azimuth), np.zeros(SECTORS)], axis=1)
@@ -382,7 +391,7 @@ def brightest(
     stars = bool((sources.place[:, 3] == 0).any())
     rows = np.argsort(-mean, kind="stable")[: most_stars if stars else most_leds]
     fraction = mean[rows] / mean.max(initial=1e-300)
-    position_m = sources.place[rows, :3] * (SKY_RADIUS_M if stars else 1.0)
+    position_m = sources.xyz[rows] * (SKY_RADIUS_M if stars else 1.0)
     sizes_m = 0.006 + 0.04 * np.sqrt(fraction) if stars else np.full(len(rows), LED_RADIUS_M)
     return stars, rows, fraction, position_m, sizes_m
 
@@ -427,14 +436,13 @@ def field_corners(
     the sky.
     """
     # Corners are half a pixel outside of the outer pixels' centers.
-    size_px = np.array([camera.width_px, camera.height_px])
-    corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * size_px - 0.5
+    corners_px = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * camera.size_px - 0.5
     xy_px = corners_px - camera.center_px
-    rays_cam = np.column_stack([xy_px, np.full(4, camera.focal_px)])
-    lab_from_cam = lab_from_body * mount.cam_from_body.inv()
+    rays_cam = homogeneous(xy_px, camera.focal_px)
+    lab_from_cam = lab_from_body * mount.body_from_cam
     rays = lab_from_cam.apply(normalized(rays_cam))
     tip_m = lab_from_body.apply(mount.camera_body_m)
-    length_m = np.linalg.norm(inside.meet(tip_m, rays) - tip_m, axis=1)
+    length_m = lengths(inside.meet(tip_m, rays) - tip_m)
     return lab_from_body.inv().apply(tip_m + np.fmin(length_m, SKY_RADIUS_M)[:, None] * rays)
 
 
@@ -449,7 +457,7 @@ def add_field(spec: Any, mount: Mount, corners_m: Floats) -> None:
     vertices = np.vstack([tip, corners_m])
     add_mesh(spec, "stage_field", vertices, sides, [*FIELD_RGB, 0.4], bus, **more)
     # Edges of the pyramid: a ray to each corner, and the side to the previous corner.
-    length_m = np.linalg.norm(corners_m - tip, axis=1).min()
+    length_m = lengths(corners_m - tip).min()
     for k, corner in enumerate(corners_m):
         for kind, end in (("ray", tip), ("edge", corners_m[k - 1])):
             add_visual_geom(
@@ -477,8 +485,7 @@ def dome_view(rings_m: Floats) -> tuple[Floats, Floats, Floats, float]:
     middle = np.array([0.0, 0.0, top - size])
     # From the azimuth -62 deg and 8 deg above.
     toward_eye = Rotation.from_euler("ZY", [-62.0, -8.0], degrees=True).apply([1.0, 0.0, 0.0])
-    up = np.array([0.0, 0.0, 1.0])
-    return middle + distance * toward_eye, middle, up, 0.55 * distance
+    return middle + distance * toward_eye, middle, UP, 0.55 * distance
 
 
 def sky_view(
@@ -486,9 +493,7 @@ def sky_view(
 ) -> tuple[Floats, Floats, Floats, float]:
     """As `dome_view`, from beside and behind the vehicle, with the boresight along the picture's diagonal."""
     size = float(vehicle.model.stat.extent) / 2 + SKY_RADIUS_M / 2
-    # A direction across the boresight, from the axis that is least along it.
-    beside = np.cross(boresight, np.eye(3)[np.argmin(np.abs(boresight))])
-    back = normalized(beside) - 0.5 * boresight
+    back = surface.perpendicular(boresight[None])[0] - 0.5 * boresight
     up = Rotation.from_rotvec(np.radians(-40.0) * normalized(back)).apply(boresight)
     return size * (2.0 * back + 0.5 * boresight), 0.5 * size * boresight, up, 1.2 * size
 

@@ -303,10 +303,8 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     its center of mass, which must be the body's origin. The steps are those of the module's docstring. Raises
     InputError.
     """
-    # 1. Body bus. The compiler must not fuse bodies until the bearing is added.
-    spec = load(path)
-    spec.compiler.fusestatic = False
-    bus = put_at_origin(spec, path)
+    # 1. Body bus.
+    spec, bus = load_at_origin(path)
     # 2. Camera.
     place_camera(spec, vehicle)
     # 3. Locking comes before the mass: a locked rotor is part of the rigid vehicle.
@@ -340,8 +338,13 @@ def compose(vehicle: VehicleConfig, path: Path) -> tuple[Any, MassProperties, Tr
     return spec, trims.moved_mass(mass), trims
 
 
-def put_at_origin(spec: Any, path: Path) -> Any:
-    """Body bus of the spec, moved to the lab's origin and without joints of its own. Raises InputError."""
+def load_at_origin(path: Path) -> tuple[Any, Any]:
+    """The spec of a file, and its body bus, moved to the lab's origin and without joints of its own. Raises InputError.
+
+    The compiler fuses no bodies, which it must not until the bearing is added.
+    """
+    spec = load(path)
+    spec.compiler.fusestatic = False
     # The file must have the bus, as a child of the world, and the camera.
     required = {"body bus": spec.body("bus"), f"camera {CAMERA}": spec.camera(CAMERA)}
     missing = [name for name, element in required.items() if element is None]
@@ -363,7 +366,7 @@ def put_at_origin(spec: Any, path: Path) -> Any:
     bus.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
     bus.pos = [0.0, 0.0, 0.0]
     bus.quat = [1.0, 0.0, 0.0, 0.0]
-    return bus
+    return spec, bus
 
 
 def place_camera(spec: Any, vehicle: VehicleConfig) -> None:

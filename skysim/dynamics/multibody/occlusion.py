@@ -19,13 +19,13 @@ from skysim.core.jit import jit
 from skysim.core.paths import SCENES
 from skysim.core.types import Bools, Floats, Mount
 from skysim.dynamics.multibody.mass import CAMERA
-from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_warnings
+from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
 from skysim.dynamics.multibody.model import (
     VehicleModel,
     camera_mount,
+    load_at_origin,
     lock_unused,
     place_camera,
-    put_at_origin,
     set_start,
 )
 
@@ -60,9 +60,7 @@ class Obstacles:
         # 1. Model with the initial angles of wheels and gimbals.
         path = SCENES / vehicle.config.model
         with mujoco_warnings():
-            spec = load(path)
-            spec.compiler.fusestatic = False
-            bus = put_at_origin(spec, path)
+            spec, bus = load_at_origin(path)
             place_camera(spec, vehicle.config)
             bus.mocap = True  # the pose of a mocap body is set, not simulated
             lock_unused(spec, vehicle.config, path)

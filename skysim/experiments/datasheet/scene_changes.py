@@ -121,7 +121,7 @@ def excluding_bodies(scene: Scene) -> tuple[str, ...]:
 
 def side_px(scene: Scene) -> int:
     """The field's smaller side."""
-    return min(scene.camera.width_px, scene.camera.height_px)
+    return min(scene.camera.size_px)
 
 
 def half_field_deg(scene: Scene) -> float:

@@ -14,7 +14,7 @@ from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
-from skysim.core.types import Bools, Floats, Record, frozen
+from skysim.core.types import UP, Bools, Floats, Record, frozen
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
     GATE_SIGMAS,
@@ -443,6 +443,6 @@ def accuracy_statistics(accuracy: SurveyAccuracy) -> Record:
 
 def stop_rows(lab_from_body: Rotation, shown: Bools) -> list[Record]:
     """Attitudes as rows: roll, pitch, yaw and tilt in degrees, and the number of LEDs that each shows."""
-    tilt_deg = np.degrees(tilts_rad(lab_from_body.apply([0.0, 0.0, 1.0])))
+    tilt_deg = np.degrees(tilts_rad(lab_from_body.apply(UP)))
     angles = dict(zip(ANGLES, euler_deg(lab_from_body).T, strict=True))
     return rows_of_columns(**angles, tilt_deg=tilt_deg, leds=shown.sum(axis=1))

@@ -175,7 +175,7 @@ def listed_prior(lab: Lab, camera: Camera) -> CalibrationPrior:
     inside = surface.build_surface(light.surface)
     design = design_of(lab)
     board = registry.board_of(light.layout, design.id)
-    leds = LedMap(design.id, design.place[:, :3], *inside.as_ellipsoid(), board)
+    leds = LedMap(design.id, design.xyz, *inside.as_ellipsoid(), board)
     return prior_of(lab, camera, leds)
 
 

@@ -14,7 +14,7 @@ from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Bools, Floats, Frame, Mount, Record, Truth
+from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -291,7 +291,7 @@ class LedErrors(NamedTuple):
 
 def led_errors(survey: DomeSurvey, prior: CalibrationPrior, lab: Lab) -> LedErrors:
     """LED position errors before and after the survey."""
-    true_m = lab.camera.sources.place[:, :3]
+    true_m = lab.camera.sources.xyz
     row = np.flatnonzero(survey.surveyed)
     position_m = survey.leds.position_m[row]
     _, nearest = cKDTree(true_m).query(position_m)
@@ -406,7 +406,7 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: Record, further: Rotation
         for led, at in zip(leds.id[rows], leds.position_m[rows, :2], strict=True):
             axes.annotate(str(led), at, (6, 6), textcoords="offset points", color=color)
     lever = so_far.model.lever
-    toward = further.apply(lever.cam_from_body.inv().apply([0.0, 0.0, 1.0])).reshape(-1, 3)
+    toward = further.apply(lever.cam_from_body.inv().apply(UP)).reshape(-1, 3)
     for n, (u, attitude) in enumerate(zip(toward, further, strict=True)):
         at = on_surface(u[None], attitude.apply(lever.camera_body_m), leds)[0]
         axes.annotate(str(n + 1), at[:2], color="tab:blue", ha="center", weight="bold")

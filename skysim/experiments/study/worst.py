@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, positive
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import without_responses
@@ -206,7 +206,7 @@ def ranking(columns: Columns, response: str) -> tuple[list[Floats], Floats]:
         else FLAGS.get(response, lambda c: c[response])(columns)
     )
     flagged = np.nan_to_num(np.asarray(flags, dtype=float))
-    return [-flagged, unsolved_first, fewest_first], np.where(flagged > 0, flagged, np.nan)
+    return [-flagged, unsolved_first, fewest_first], positive(flagged)
 
 
 def worst_of_levels(

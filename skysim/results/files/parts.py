@@ -259,7 +259,7 @@ class DomeDesign:
     @property
     def led_m(self) -> Floats:
         """(N, 3) places of the LEDs."""
-        return self.leds.place[:, :3]
+        return self.leds.xyz
 
     @property
     def led_radius_m(self) -> float:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from skysim.core import files
 from skysim.core.constants import INCH_M
 from skysim.core.errors import check_name
-from skysim.core.types import Floats, normalized
+from skysim.core.types import UP, Floats, azimuths_rad, normalized
 from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
@@ -166,7 +166,7 @@ def length_m(points_m: Floats) -> Floats:
 
 def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
     """(N, 2) x and y on the gore of a meridian of points in these directions (N, 3) from the bearing."""
-    azimuth_rad = np.arctan2(rays[:, 1], rays[:, 0]) - meridian_rad
+    azimuth_rad = azimuths_rad(rays) - meridian_rad
     tilt_rad = tilts_rad(rays)
     aside_rad = np.arcsin(np.clip(np.sin(tilt_rad) * np.sin(azimuth_rad), -1, 1))
     foot_rad = np.arctan2(np.sin(tilt_rad) * np.cos(azimuth_rad), np.cos(tilt_rad))
@@ -208,7 +208,7 @@ class Gore(NamedTuple):
 def gore(dome: DomeDesign, number: int, count: int) -> Gore:
     """Gore `number`, from 0, of `count`: outline, meridian, title, a circle and a number for each LED."""
     rays = normalized(dome.led_m)
-    turns = np.arctan2(rays[:, 1], rays[:, 0]) * count / (2 * np.pi)
+    turns = azimuths_rad(rays) * count / (2 * np.pi)
     own = np.rint(turns).astype(int) % count == number
     meridian_rad = 2 * math.pi / count * number
     edge = outline(meridian_rad, math.pi / count, dome.cap_deg)
@@ -298,7 +298,7 @@ def shell_obj(dome: DomeDesign) -> str:
     rings_m = at(
         dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
     ).reshape(-1, 3)
-    vertices_m = np.concatenate([at(dome.surface, np.array([[0.0, 0.0, 1.0]])), rings_m])
+    vertices_m = np.concatenate([at(dome.surface, UP[None]), rings_m])
     lines = [
         f"# {dome.name}: inner surface and LEDs, mm from the bearing's center, z up",
         "o shell",

@@ -625,6 +625,11 @@ class CameraConfig(ConfigModel):
         return shutter.row_time_s if isinstance(shutter, RollingShutterConfig) else 0.0
 
     @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the detector."""
+        return self.width_px, self.height_px
+
+    @property
     def focal_px(self) -> float:
         """Image distance in pixels, which is the focal length of a star tracker: pixels per unit tangent."""
         return self.image_distance_m / self.pixel_m

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.types import Floats
+from skysim.core.types import UP, Floats
 from skysim.dynamics import multibody
 from skysim.simulation.lab import Lab
 
@@ -56,7 +56,7 @@ class CheckedAttitudes(NamedTuple):
     def boresights(self) -> Floats:
         """(N, 3) unit vectors of the boresight in lab axes."""
         cam_from_body = self.lab.camera.mount.cam_from_body
-        return (self.lab_from_body * cam_from_body.inv()).apply([0.0, 0.0, 1.0])
+        return (self.lab_from_body * cam_from_body.inv()).apply(UP)
 
     @property
     def rates_text(self) -> str:

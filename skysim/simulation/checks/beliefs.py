@@ -120,7 +120,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
             mapped.focal_sigma_px / mapped.focal_px,
             np.zeros(3),
             np.zeros(3),
-            faults=map_faults(mapped, lab, lights.place[:, :3]),
+            faults=map_faults(mapped, lab, lights.xyz),
         )
     # 3. Else those of the survey. An instrument gives each LED its own covariance.
     survey = tracker.survey
@@ -186,7 +186,7 @@ def known_lights(
     sources = lab.camera.sources
     row = np.flatnonzero(np.isin(sources.id, stars.id))
     star = rows_of(sources.id[row], stars.id)
-    place = normalized(sources.place[:, :3])
+    place = normalized(sources.xyz)
     rate_e_s = sources.strength * lab.camera.optics.collecting_m2
     shift = neighbor_shift(place, rate_e_s, row, camera)
     error = place[row] + shift - stars.vectors[star]

@@ -223,7 +223,7 @@ def usable(view: View, context: Context) -> View:
     settings = context.settings
     config = context.scene.camera
     # Distance of each image from the nearest edges, which must exceed its half size.
-    far_px = np.array([config.width_px, config.height_px]) - 1 - view.xy_px
+    far_px = np.array(config.size_px) - 1 - view.xy_px
     edge = np.minimum(view.xy_px, far_px)
     half_px = np.abs(view.streak_px) / 2 + detected_radius_px(view, context)[:, None]
     large = detected_area_px(view, context) >= settings.min_area_px

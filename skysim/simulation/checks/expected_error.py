@@ -143,7 +143,7 @@ def survey_setup(view: View, context: Context) -> Floats | None:
     if instrument is None:
         return None
     shifts_m = survey_errors.station_displacements_m(
-        instrument, context.beliefs.lights.place[view.row, :3]
+        instrument, context.beliefs.lights.xyz[view.row]
     )
     parts = [displacement(view, shift_m) for shift_m in shifts_m]
     return np.concatenate(parts, axis=2) if parts else None
@@ -186,7 +186,7 @@ def surface_survey(view: View, context: Context) -> Floats | None:
     surface = context.surface
     if not sigma_m or surface is None:
         return None
-    normal = surface.inward(context.beliefs.lights.place[view.row, :3])
+    normal = surface.inward(context.beliefs.lights.xyz[view.row])
     return displacement(view, -sigma_m * normal)
 
 
@@ -195,7 +195,7 @@ def survey_rotation(view: View, context: Context) -> Floats | None:
     rotation_rad = context.beliefs.rotation_rad
     if not rotation_rad.any():
         return None
-    shift_m = np.cross(rotation_rad, context.beliefs.lights.place[view.row, :3])
+    shift_m = np.cross(rotation_rad, context.beliefs.lights.xyz[view.row])
     return displacement(view, shift_m)
 
 
@@ -494,7 +494,7 @@ def solver_error(view: View, context: Context) -> Floats | None:
     surface = context.surface
     if surface is None or name in EXACT_SOLVERS:
         return None
-    place_m = context.beliefs.lights.place[view.row, :3]
+    place_m = context.beliefs.lights.xyz[view.row]
     center_m, semi_axes_m = surface.as_ellipsoid()
     leds = LedMap(view.row, place_m, center_m, semi_axes_m, None, 0.0)
     cam_from_body = mount.cam_from_body

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Record, around_z
+from skysim.core.types import Floats, Record, around_z, polar_rad
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
@@ -260,10 +260,10 @@ def cap_margin(plan: Plan, tilt_deg: float | None = None) -> CapMargin | None:
     if getattr(points, "boards", ()):
         return None
     listed = points.kind == "listed"
-    cap_deg = max_tilt_deg(plan.lab.camera.sources.place[:, :3]) if listed else points.cap_deg
+    cap_deg = max_tilt_deg(plan.lab.camera.sources.xyz) if listed else points.cap_deg
     if tilt_deg is None:
         tilt_deg = float(plan.reach.attitudes.tilts_deg.max())
-    edge = field_reach_deg(plan, max(camera.width_px, camera.height_px) / 2, tilt_deg)
+    edge = field_reach_deg(plan, max(camera.size_px) / 2, tilt_deg)
     corner = field_reach_deg(plan, camera.corner_px, tilt_deg)
     return CapMargin(cap_deg, tilt_deg, edge, corner, points.cap_deg)
 
@@ -283,11 +283,11 @@ def field_reach_deg(context: Context, radius_px: float, tilt_deg: float) -> floa
     tilts = np.column_stack([azimuth, np.full(SIDES, math.radians(tilt_deg)), -azimuth])
     needed_deg = 0.0
     for lab_from_body in Rotation.from_euler("ZYZ", tilts):
-        rays = lab_from_body.apply(mount.cam_from_body.inv().apply(rays_cam))
+        rays = lab_from_body.apply(mount.body_from_cam.apply(rays_cam))
         met = surface.meet(lab_from_body.apply(mount.camera_body_m), rays)
         if np.isnan(met).any():
             return math.inf
-        zenith_rad = np.arctan2(np.hypot(*met.T[:2]), met[:, 2])
+        zenith_rad = polar_rad(met)
         needed_deg = max(needed_deg, float(np.degrees(zenith_rad).max()))
     return needed_deg
 

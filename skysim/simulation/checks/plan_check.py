@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.camera import wcs
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, polar_rad
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -200,7 +200,7 @@ def heads_fact(lab: Lab, facts: Sequence[Sequence[Fact]]) -> Fact:
     total = np.zeros((3, 3))
     main = lab.camera.mount.cam_from_body
     for camera, (cross, roll) in zip(lab.cameras, errors, strict=True):
-        R_main_from_cam = (main * camera.mount.cam_from_body.inv()).as_matrix()
+        R_main_from_cam = (main * camera.mount.body_from_cam).as_matrix()
         # The variance of cross is the sum of those about x and y, half of it each.
         information = 1 / np.array([cross**2 / 2, cross**2 / 2, roll**2])
         total += R_main_from_cam @ np.diag(np.nan_to_num(information)) @ R_main_from_cam.T
@@ -255,7 +255,7 @@ def dome_warnings(lab: Lab) -> list[str]:
     # width D f / d. Defocus of a thin lens with the pupil A adds A |1 / d - 1 / focus| f.
     if scene.tracker.detector == "local":
         camera = scene.camera
-        distance_m = np.linalg.norm(sources.place[:, :3], axis=1)
+        distance_m = np.linalg.norm(sources.xyz, axis=1)
         typical_m = float(
             np.median(distance_m - np.linalg.norm(lab.camera.mount.camera_body_m))
         )
@@ -361,9 +361,9 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     typical_px = float(np.median(np.concatenate(sigma_px)))
     coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px
     # 2. Greatest tilt of the fields, reduced to what most_work allows.
-    place_m = plan.beliefs.lights.place[:, :3]
+    place_m = plan.beliefs.lights.xyz
     most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
-    zenith_rad = np.sort(np.arctan2(np.hypot(*place_m.T[:2]), place_m[:, 2]))
+    zenith_rad = np.sort(polar_rad(place_m))
     tilt_rad = math.radians(plan.reach.attitudes.tilts_deg.max())
     if len(zenith_rad) >= most:
         tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))

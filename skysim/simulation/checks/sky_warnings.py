@@ -132,8 +132,8 @@ def in_field(direction_cam: Floats, radius_rad: float, camera: CameraConfig) -> 
     if direction_cam[2] <= 0:
         return False
     xy_px = camera.focal_px * np.abs(direction_cam[:2]) / direction_cam[2]
-    size_px = np.array([camera.width_px, camera.height_px])
-    return bool((xy_px < size_px / 2 + camera.focal_px * math.tan(radius_rad)).all())
+    half_px = np.array(camera.size_px) / 2
+    return bool((xy_px < half_px + camera.focal_px * math.tan(radius_rad)).all())
 
 
 # Claimed errors: the expected normalized estimation error squared (NEES) under the stars.

@@ -211,9 +211,9 @@ def view(
     chosen = lit.points.take(row)
     # 2. Electrons.
     rate_e_s = rates_e_s(chosen, optics, lit.emitter, distance_m, cos_out, cos_in)
-    electrons = rate_e_s * np.minimum(chosen.on_s / chosen.period_s, 1.0) * camera.exposure_s
+    electrons = rate_e_s * chosen.duty * camera.exposure_s
     # 3. Vectors, derivatives, paths.
-    arm_m = exposure.cam_from_lab.apply(chosen.place[:, :3])
+    arm_m = exposure.cam_from_lab.apply(chosen.xyz)
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
     streak_px = paths_px(exposure, camera.exposure_s, chosen.motion, arm_m, gradient)
@@ -229,7 +229,7 @@ def view(
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
         exposure.time,
-        exposure.lab_from_body * camera.mount.cam_from_body.inv(),
+        exposure.lab_from_body * camera.mount.body_from_cam,
         row,
         xy_px,
         offset_m,

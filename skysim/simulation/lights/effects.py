@@ -60,12 +60,10 @@ class WallGlow(AddedLight):
     warm_up: WarmUpConfig | None
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit("the dome's wall", glow=lambda: self.glow(exposure))
-
-    def glow(self, exposure: Exposure) -> Floats:
-        """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
-        full = wall_glow(self.dome, exposure.camera)
-        return warm_up_factor(self.warm_up, exposure.t_s) * full
+        warm = warm_up_factor(self.warm_up, exposure.t_s)
+        return Lit(
+            "the dome's wall", glow=lambda: warm * wall_glow(self.dome, exposure.camera)
+        )
 
 
 @frozen
@@ -180,12 +178,10 @@ class AirGlow(AddedLight):
     config: AirGlowConfig
 
     def during(self, exposure: Exposure) -> Lit:
-        return Lit("the air", glow=lambda: self.glow(exposure))
-
-    def glow(self, exposure: Exposure) -> Floats:
-        """(h, w) electrons s^-1 px^-1 at the nodes of the background."""
-        view = exposure.camera.nodes()
-        return air_glow(self.config, self.air.at(exposure.time), view).reshape(view.shape)
+        sky = self.air.at(exposure.time)
+        return Lit(
+            "the air", glow=lambda: air_glow(self.config, sky, exposure.camera.nodes())
+        )
 
 
 def seen_through(sky: Sky, lit: Lit, exposure: Exposure) -> Lit:

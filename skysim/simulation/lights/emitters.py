@@ -14,7 +14,7 @@ from skysim.camera.glow.display_glow import black_glow
 from skysim.camera.glow.earth_glow import earth_around, earth_light
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Sources, StarSources, frozen
+from skysim.core.types import Bools, Floats, Sources, StarSources, frozen, homogeneous
 from skysim.scene.sections.light import (
     BodiesConfig,
     CollimatedDisplayConfig,
@@ -132,9 +132,9 @@ class LedDome(KnownLight):
         if seed not in self._timing:
             while len(self._timing) >= MAX_RUNS:
                 self._timing.pop(next(iter(self._timing)))
-            clocks = build_clocks(self.config, self.sources, seed)
             self._timing[seed] = LedTiming(
-                clocks, build_codes(self.config, self.sources, seed)
+                build_clocks(self.config, self.sources, seed),
+                build_codes(self.config, self.sources, seed),
             )
         return self._timing[seed]
 
@@ -203,8 +203,8 @@ class StarsInOrbit(KnownLight):
         assert isinstance(self.sources, StarSources)
         near = self.sources.take(self.sources.within(view.boresight, reach_rad))
         now_m_s = 1e3 * exposure.observer.velocity_km_s
-        direction = stars.seen_at_velocity(near.place[:, :3], self.velocity_m_s, now_m_s)
-        place = np.column_stack([direction, np.zeros(len(near))])
+        direction = stars.seen_at_velocity(near.xyz, self.velocity_m_s, now_m_s)
+        place = homogeneous(direction, 0.0)
         return Lit("stars", True, replace(near, place=place), self.emitter)
 
 

@@ -26,6 +26,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import Poses
 from skysim.camera.render import OcclusionTest, Window
 from skysim.core.types import (
+    UP,
     Bools,
     Floats,
     Mount,
@@ -128,7 +129,7 @@ class Exposure:
     @cached_property
     def boresight(self) -> Floats:
         """(3,) unit vector of the boresight in lab axes at mid-exposure."""
-        return self.cam_from_lab.inv().apply([0.0, 0.0, 1.0])
+        return self.cam_from_lab.inv().apply(UP)
 
     @cached_property
     def view(self) -> ExposureView:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints, normalized, taken
+from skysim.core.types import Floats, Ints, lengths, normalized, taken
 from skysim.scene.sections import layouts, leds
 from skysim.sources import catalog
 from skysim.sources import stars as star_sources
@@ -75,9 +75,7 @@ def project_stars(
     stars = stars.take(above_horizon)
     # 2.
     place_m = surface.meet(camera_m, direction[above_horizon])
-    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * np.linalg.norm(
-        place_m, axis=1
-    )
+    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * lengths(place_m)
     stars = stars.take(within)
     place_m = place_m[within]
     order = np.argsort(stars.v_mag, kind="stable")
@@ -203,7 +201,7 @@ def led_levels(
         For an LED whose lobe does not reach the camera.
     """
     to_camera = np.array(config.camera_m) - stars.place_m
-    distance_m = np.linalg.norm(to_camera, axis=1)
+    distance_m = lengths(to_camera)
     cos_emission = np.einsum("nj,nj->n", normal, to_camera) / distance_m
     ones = np.ones(len(distance_m))
     # Irradiance per unit strength on an aperture that faces the LED, as stars at infinity are measured.

@@ -36,6 +36,7 @@ from skysim.core.types import Floats, Ints
 from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig
 
 Words = NDArray[np.uint8]
+NO_WORDS: Words = np.zeros((0, 1), np.uint8)
 
 # Primitive polynomials over GF(2) by degree, as bits: x^5 + x^2 + 1 is 0b100101.
 PRIMITIVE = {3: 0b1011, 4: 0b10011, 5: 0b100101, 6: 0b1000011, 7: 0b10001001}
@@ -166,7 +167,7 @@ def bch(count: int, distance: int) -> Words:
         if 2**degree - 1 - checks >= data:
             word = multiply(np.arange(2**data), generator)
             return balanced(bits_of(word, data + checks))[:count]
-    return np.zeros((0, 1), np.uint8)
+    return NO_WORDS
 
 
 def cyclic(count: int, distance: int) -> Words:
@@ -184,7 +185,7 @@ def cyclic(count: int, distance: int) -> Words:
         word = orbits(multiply(np.arange(1, 2**data), generator), length)
         if len(word) >= count:
             return balanced(bits_of(word, length))[:count]
-    return np.zeros((0, 1), np.uint8)
+    return NO_WORDS
 
 
 def gold(count: int) -> Words:
@@ -202,7 +203,7 @@ def gold(count: int) -> Words:
         family = np.vstack([u, v, *(u ^ np.roll(v, shift) for shift in range(length))])
         shifted = [np.roll(family, shift, axis=1) for shift in range(length)]
         return balanced(np.vstack(shifted))[:count]
-    return np.zeros((0, 1), np.uint8)
+    return NO_WORDS
 
 
 def maximal_sequence(polynomial: int, degree: int) -> Words:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Ints, Sources, normalized
+from skysim.core.types import Bools, Floats, Ints, Sources, homogeneous, lengths, normalized
 from skysim.scene.sections import layouts, leds, light
 from skysim.scene.sections.layouts import LensDisplayConfig, ProjectorConfig
 from skysim.scene.sections.leds import LedConfig
@@ -174,11 +174,11 @@ def panel_sources(
         For a star nearer to black than to the first gray level.
     """
     # In the panel's own frame, and back from the rounded places.
-    own_m = panel.lab_from_own.inv().apply(stars.place[:, :3] - panel.center_m)
+    own_m = panel.lab_from_own.inv().apply(stars.xyz - panel.center_m)
     blocks = visible_blocks(
         config, own_m[:, :2], stars.strength / full_strength_e_s_sr(led, band)
     )
-    flat_m = np.column_stack([blocks.center_px * config.pitch_m, np.zeros(len(blocks.star))])
+    flat_m = homogeneous(blocks.center_px * config.pitch_m, 0.0)
     place_m = panel.center_m + panel.lab_from_own.apply(flat_m)
     radius_m = config.block * led.disk_diameter_m / 2
     row = blocks.corner_px[:, 1] / config.pixels[1]
@@ -241,7 +241,7 @@ def block_sources(
     strength = full * scatter * pulses.strength * gain
     return Sources(
         id=stars.id[blocks.star],
-        place=np.column_stack([place_m, np.ones(count)]),
+        place=homogeneous(place_m, 1.0),
         normal=surface.inward(place_m),
         radius_m=np.broadcast_to(radius_m, (count,)).copy(),
         **pulses._replace(strength=strength)._asdict(),
@@ -307,7 +307,7 @@ def display_sources(
     # 3.
     shown_m = blocks.center_px * config.pitch_m
     shown_m *= undistortion(config, shown_m)[:, None]
-    beam = np.column_stack([shown_m, np.full(len(shown_m), config.focal_length_m)])
+    beam = homogeneous(shown_m, config.focal_length_m)
     white_e_s_m2 = float(star_flux_e_s_m2(config.brightest_mag, *SUN, band))
     beams = beam_sources(config, beam, white_e_s_m2 * blocks.level, stars.take(blocks.star))
     b_v, v_i = (np.full(len(beam), color) for color in SUN)
@@ -327,7 +327,7 @@ def beam_sources(
         return beams
     return dataclasses.replace(
         beams,
-        place=np.column_stack([direction * config.conjugate_m, np.ones(len(beam))]),
+        place=homogeneous(direction * config.conjugate_m, 1.0),
         normal=-direction,
         strength=flux_e_s_m2 * config.conjugate_m**2,
     )
@@ -375,7 +375,7 @@ def on_chip_m(config: LensDisplayConfig, own: Floats) -> tuple[Floats, Bools]:
 
 def undistortion(config: LensDisplayConfig, chip_m: Floats) -> Floats:
     """(N,) factors from places (N, 2) on the chip to those without distortion, by Newton's method."""
-    radius = np.linalg.norm(chip_m, axis=1) / config.focal_length_m
+    radius = lengths(chip_m) / config.focal_length_m
     tangent = radius
     for _ in range(NEWTON_STEPS if config.distortion else 0):
         excess = tangent * (1 + config.distortion * tangent**2) - radius
@@ -386,10 +386,7 @@ def undistortion(config: LensDisplayConfig, chip_m: Floats) -> Floats:
 def rays(config: ProjectorConfig, chip_m: Floats) -> Floats:
     """(N, 3) unit rays in the lab through places (N, 2) on the chip."""
     stretch = undistortion(config, chip_m)
-    own = np.column_stack(
-        [chip_m / config.focal_length_m * stretch[:, None], np.ones(len(chip_m))]
-    )
-    own = normalized(own)
+    own = normalized(homogeneous(chip_m / config.focal_length_m * stretch[:, None], 1.0))
     return own_from_lab(config).inv().apply(own)
 
 
@@ -458,9 +455,7 @@ def projector_sources(
             "light.layout.position", f"{config.position_m} m is outside of the dome", "inside"
         )
     # 1.
-    chip_m, shown = on_chip_m(
-        config, own_from_lab(config).apply(stars.place[:, :3] - position_m)
-    )
+    chip_m, shown = on_chip_m(config, own_from_lab(config).apply(stars.xyz - position_m))
     if not shown.all():
         raise InputError(
             "light.layout.points",
@@ -496,7 +491,7 @@ def white_wall_per_m2(config: ProjectorConfig, place_m: Floats, normal: Floats) 
     sight_m = place_m - np.array(config.position_m)
     own = own_from_lab(config).apply(sight_m)
     _, shown = on_chip_m(config, own)
-    distance_m = np.linalg.norm(sight_m, axis=1)
+    distance_m = lengths(sight_m)
     cos_axis = np.where(shown, own[:, 2] / distance_m, 1.0)
     cos_incidence = -np.sum(normal * sight_m, axis=1) / distance_m
     area_m2 = pixel_sr(config, cos_axis) * distance_m**2 / np.maximum(cos_incidence, 0)

@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Sources, around_z, joined
+from skysim.core.types import UP, Floats, Sources, around_z, joined
 from skysim.scene.sections.leds import Lobe
 from skysim.scene.sections.light import DomeConfig, FloorConfig, ReflectionConfig
 from skysim.sources.dome.led import LOBES
@@ -82,10 +82,9 @@ def diffuse_light(
     if config.floor:
         patches = joined([patches, floor_patches(config.floor)])
     # 2. Direct light, with the strengths averaged over the pulses.
-    duty = np.minimum(leds.on_s / leds.period_s, 1.0)
     sampled = LOBES[lobe.kind](lobe, np.linspace(0, 1, LOBE_SAMPLES))
-    place_m = np.ascontiguousarray(leds.place[:, :3])
-    emitters = Emitters(place_m, leds.normal, leds.strength * duty, sampled)
+    place_m = np.ascontiguousarray(leds.xyz)
+    emitters = Emitters(place_m, leds.normal, leds.strength * leds.duty, sampled)
     direct = irradiance(patches.place_m, patches.normal, emitters)
     # 3. Sum over the patches: K rho A E.
     transfer = kernel(patches) * (patches.reflectance * patches.area_m2)
@@ -124,7 +123,7 @@ def floor_patches(config: FloorConfig) -> Patches:
     area_m2 = np.full(PATCHES, np.pi * config.radius_m**2 / PATCHES)
     return Patches(
         place_m,
-        np.tile([0.0, 0.0, 1.0], (PATCHES, 1)),
+        np.tile(UP, (PATCHES, 1)),
         area_m2,
         np.full(PATCHES, config.share),
     )

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from skysim.core.types import Bools, Floats, Ints, Sources, normalized
+from skysim.core.types import Bools, Floats, Ints, Sources, homogeneous, lengths, normalized
 from skysim.scene.sections.light import ReflectionConfig
 from skysim.sources.dome.surface import Surface, perpendicular
 from skysim.sources.satellites import MIRRORED
@@ -67,8 +67,8 @@ def mirrored(
     if not wall.inside(camera_m):
         return leds.take(np.zeros(0, np.int64))
     # 1.
-    led, start = nearest_rays(wall, leds.place[:, :3], camera_m, grid)
-    led_m = leds.place[led, :3]
+    led, start = nearest_rays(wall, leds.xyz, camera_m, grid)
+    led_m = leds.xyz[led]
     toward = grid.reshape(-1, 3)[start]
     # 2. A step is limited, since far from the solution the linear law may lead anywhere.
     for _ in range(STEPS):
@@ -81,9 +81,9 @@ def mirrored(
     offset, jacobian, _ = linearized(wall, led_m, camera_m, toward)
     rays = reflect(wall, camera_m, toward)
     to_led = led_m - rays.wall_m
-    far_m = np.linalg.norm(to_led, axis=1)
-    path_m = np.linalg.norm(rays.wall_m - camera_m, axis=1)
-    solved = (np.linalg.norm(offset, axis=1) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
+    far_m = lengths(to_led)
+    path_m = lengths(rays.wall_m - camera_m)
+    solved = (lengths(offset) < CLOSE * far_m) & (far_m > TOUCHING * path_m)
     solved &= np.isfinite(wall.meet(camera_m, toward)[:, 0])
     solved &= np.sum(to_led * rays.along, axis=1) > 0
     solved &= cosines_to_grid(toward, grid) > 0
@@ -99,7 +99,7 @@ def mirrored(
     return replace(
         sources,
         id=sources.id + MIRRORED * numbered(led[found]),
-        place=np.column_stack([virtual_m, np.ones(len(sources))]),
+        place=homogeneous(virtual_m, 1.0),
         normal=sources.normal - 2 * across * normal,
         strength=sources.strength * reflectance(config, rays.cosine[found]),
     )
@@ -130,7 +130,7 @@ def distinct(led: Ints, toward: Floats, solved: Bools) -> Ints:
     rows = np.flatnonzero(solved)
     rows = rows[np.lexsort([*np.round(toward[rows] / SAME_RAD).T, led[rows]])]
     same_led = np.diff(led[rows]) == 0
-    apart = np.linalg.norm(np.diff(toward[rows], axis=0), axis=1)
+    apart = lengths(np.diff(toward[rows], axis=0))
     same = same_led & (apart < 3 * SAME_RAD)
     return rows[~np.concatenate([[False], same])] if len(rows) else rows
 

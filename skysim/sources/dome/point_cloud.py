@@ -18,7 +18,15 @@ import scipy
 from skysim.core.constants import INCH_M
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats, around_z, frozen
+from skysim.core.types import (
+    Floats,
+    around_z,
+    azimuths_rad,
+    frozen,
+    homogeneous,
+    lengths,
+    polar_rad,
+)
 
 KEY = "light.surface.file"  # names the file of points
 UNIT_M = {"m": 1.0, "cm": 0.01, "mm": 1e-3, "in": INCH_M}
@@ -68,7 +76,7 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
     scale_m = np.ptp(points_m, axis=0).max()
     scaled = (points_m - mean_m) / scale_m
     # 1.
-    design = np.column_stack([2 * scaled, np.ones(len(scaled))])
+    design = homogeneous(2 * scaled, 1.0)
     algebraic, _, rank, _ = np.linalg.lstsq(design, np.sum(scaled**2, axis=1), rcond=1e-9)
     if rank < 4:
         raise ValueError("the points lie in a plane or on a line")
@@ -76,7 +84,7 @@ def fit_sphere(points_m: Floats) -> FittedSphere:
 
     # 2.
     def residual(parameters: Floats) -> Floats:
-        return np.linalg.norm(scaled - parameters[:3], axis=1) - parameters[3]
+        return lengths(scaled - parameters[:3]) - parameters[3]
 
     start = np.append(algebraic[:3], radius)
     solution = scipy.optimize.least_squares(
@@ -105,8 +113,8 @@ def fit_ellipsoid(points_m: Floats) -> FittedEllipsoid:
         # Logarithms as parameters keep the semi-axes positive.
         axes = np.exp(parameters[3:]) * sphere.radius_m
         w = (points_m - sphere.center_m - sphere.radius_m * parameters[:3]) / axes
-        norm = np.linalg.norm(w, axis=1)
-        return (norm - 1) * norm / np.linalg.norm(w / axes, axis=1)
+        norm = lengths(w)
+        return (norm - 1) * norm / lengths(w / axes)
 
     solution = scipy.optimize.least_squares(
         residual_m,
@@ -194,7 +202,7 @@ class Zernike:
         """(N,) radius over (N, 3) unit vectors, and (N, 3) its gradient."""
         # Directions beyond the cap get the radius of its edge.
         disk, stretch, log_slope = to_disk(unit, self.half_rad)
-        distance = np.maximum(np.linalg.norm(disk, axis=1), 1.0)
+        distance = np.maximum(lengths(disk), 1.0)
         value, slope = zernike(self.degree, disk / distance[:, None])
         along = np.where(distance > 1, 0.0, np.einsum("nkj,k->jn", slope, self.coefficient_m))
         gradient = np.column_stack(
@@ -268,8 +276,8 @@ def read(file: str, unit: str) -> Floats:
 
 def covered_rad(unit: Floats) -> tuple[float, float]:
     """Angles from +z up to which directions (N, 3) cover all azimuths, and of the farthest direction."""
-    angle = np.arctan2(np.hypot(*unit.T[:2]), unit[:, 2])
-    azimuth = np.arctan2(unit[:, 1], unit[:, 0])
+    angle = polar_rad(unit)
+    azimuth = azimuths_rad(unit)
     sector = np.floor((azimuth / (2 * np.pi) + 0.5) * SECTORS).astype(int) % SECTORS
     # Of the farthest point in each sector of azimuth, the least.
     farthest = [float(angle[sector == n].max(initial=0.0)) for n in range(SECTORS)]

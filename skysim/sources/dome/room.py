@@ -8,7 +8,7 @@ shell bulges by 1.5e-4 of its radius at most.
 import numpy as np
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import UP, Bools, Floats, Record
 from skysim.scene.sections.light import RoomConfig
 from skysim.sources.dome.surface import Plane, Surface, directions
 
@@ -140,8 +140,8 @@ def best_box(
     across = np.array([-np.sin(middle_rad), np.cos(middle_rad), 0.0])
     outward = np.array([np.cos(middle_rad), np.sin(middle_rad), 0.0])
     turn = np.linspace(0, np.pi / 2, TURNS)[:, None]
-    first = np.cos(turn) * outward + np.sin(turn) * np.array([0.0, 0.0, 1.0])
-    second = -np.sin(turn) * outward + np.cos(turn) * np.array([0.0, 0.0, 1.0])
+    first = np.cos(turn) * outward + np.sin(turn) * UP
+    second = -np.sin(turn) * outward + np.cos(turn) * UP
     # Sides along the three axes.
     sides_m = np.column_stack([np.ptp(points_m @ axes.T, axis=0) for axes in (first, second)])
     sides_m = np.sort(

@@ -17,7 +17,17 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Record, around_z, frozen, normalized
+from skysim.core.types import (
+    UP,
+    Bools,
+    Floats,
+    Record,
+    around_z,
+    frozen,
+    lengths,
+    normalized,
+    positive,
+)
 from skysim.scene.sections import light
 from skysim.sources.dome import point_cloud
 from skysim.sources.dome.point_cloud import FittedEllipsoid, fit_ellipsoid
@@ -57,7 +67,7 @@ class Rim:
         """(N,) whether (N, 3) points in the surface's own frame are within the rim; False for NaN."""
         # cos(angle) >= cos(half_rad), times the distance from the bearing.
         from_bearing_m = own_m - self.bearing_m
-        slack = SLACK_M - np.cos(self.half_rad) * np.linalg.norm(from_bearing_m, axis=1)
+        slack = SLACK_M - np.cos(self.half_rad) * lengths(from_bearing_m)
         return (own_m[:, 2] >= self.lowest_m - SLACK_M) & (from_bearing_m[:, 2] + slack >= 0)
 
 
@@ -99,20 +109,19 @@ class Surface(ABC):
 
     def meet(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N, 3) points where rays (N, 3) of any length leave the inside; NaN where they miss or pass below the rim."""
-        R_lab_from_own = self.lab_from_own.as_matrix()
-        # A rotation keeps lengths, so the distance along the ray is the same in both frames.
-        start = (origin_m - self.center_m) @ R_lab_from_own
-        along = rays @ R_lab_from_own
+        start, along = self.own_rays(origin_m, rays)
         distance = self.distance(start, along)
         within = self.within(start + distance[:, None] * along)
         return origin_m + np.where(within, distance, np.nan)[:, None] * rays
 
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
+        return self.distance(*self.own_rays(origin_m, rays))
+
+    def own_rays(self, origin_m: Floats, rays: Floats) -> tuple[Floats, Floats]:
+        """Origin and rays of the lab in the surface's own frame; a rotation keeps lengths and distances."""
         R_lab_from_own = self.lab_from_own.as_matrix()
-        return self.distance(
-            (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
-        )
+        return (origin_m - self.center_m) @ R_lab_from_own, rays @ R_lab_from_own
 
     def inward(self, points_m: Floats) -> Floats:
         """(N, 3) unit normals toward the inside, at points of the surface: minus the level's gradient."""
@@ -131,7 +140,7 @@ class Surface(ABC):
         min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
         ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
         sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-        rays = unit_vectors(*np.meshgrid(ring_z, sectors, indexing="ij")).reshape(-1, 3)
+        rays = unit_vectors(ring_z[:, None], sectors).reshape(-1, 3)
         # Keep the rays that meet the surface within its rim.
         met = self.meet(np.zeros(3), self.lab_from_own.apply(rays))
         return met[np.isfinite(met[:, 0])]
@@ -158,8 +167,7 @@ def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
 def perpendicular(unit: Floats) -> Floats:
     """(N, 3) one unit vector perpendicular to each of (N, 3) unit vectors; along the surface for its normals."""
     # The axis on which the vector has its least component is never parallel to it.
-    across = np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)])
-    return normalized(across)
+    return normalized(np.cross(unit, np.eye(3)[np.abs(unit).argmin(axis=1)]))
 
 
 def exit_distance(start: Floats, along: Floats) -> Floats:
@@ -173,9 +181,9 @@ def exit_distance(start: Floats, along: Floats) -> Floats:
     c = start @ start - 1
     discriminant = b**2 - a * c
     q = np.abs(b) + np.sqrt(np.where((discriminant >= 0) & (a > 0), discriminant, np.nan))
-    q = np.where(q > 0, q, np.nan)
-    root = np.where(b > 0, -c / q, q / np.where(a > 0, a, np.nan))
-    return np.where(root > 0, root, np.nan)
+    q = positive(q)
+    root = np.where(b > 0, -c / q, q / positive(a))
+    return positive(root)
 
 
 @frozen
@@ -213,26 +221,21 @@ class Plane(Surface):
 
     half_m: Floats = field(default_factory=lambda: np.full(2, np.inf))
 
-    @property
-    def height_m(self) -> float:
-        """Height of its center above the bearing."""
-        return float(self.center_m[2])
-
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
-        return own_m[:, 2], np.tile([0.0, 0.0, 1.0], (len(own_m), 1))
+        return own_m[:, 2], np.tile(UP, (len(own_m), 1))
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
         """As `Surface.distance`; NaN for rays that point down."""
         # Only rays that point up meet the panel.
-        distance = -start_m[2] / np.where(along[:, 2] > 0, along[:, 2], np.nan)
-        return np.where(distance > 0, distance, np.nan)
+        distance = -start_m[2] / positive(along[:, 2])
+        return positive(distance)
 
     def within(self, own_m: Floats) -> Bools:
         return np.all(np.abs(own_m[:, :2]) <= self.half_m + SLACK_M, axis=1)
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
         """A sphere so large that it is flat to a micrometer within a meter."""
-        up = self.lab_from_own.apply([0.0, 0.0, 1.0])
+        up = self.lab_from_own.apply(UP)
         return FittedEllipsoid(
             self.center_m - FLAT_RADIUS_M * up, np.full(3, FLAT_RADIUS_M), 0.0
         )
@@ -328,7 +331,7 @@ class Radial(Surface):
 
     def within(self, own_m: Floats) -> Bools:
         """(N,) whether points are within the rim and in directions for which the radius is defined."""
-        cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * np.linalg.norm(own_m, axis=1)
+        cosine = own_m[:, 2] - np.cos(self.radius.cover_rad) * lengths(own_m)
         return self.rim.contains(own_m) & (cosine >= -SLACK_M)
 
     def distance(self, start_m: Floats, along: Floats) -> Floats:
@@ -366,7 +369,7 @@ class Radial(Surface):
             # 3.
             # Derivative of the level along the ray.
             slope = np.sum(gradient * along, axis=1)
-            step = distance - level / np.where(slope > 0, slope, np.nan)
+            step = distance - level / positive(slope)
             newton = (step > low) & (step < high) & (np.abs(level) <= before / 2)
             before = np.abs(level)
             distance = np.where(
@@ -533,7 +536,7 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     least = np.cos(np.radians(cap_deg))
     cosine = (1 + least) / 2 + (1 - least) / 2 * node
     azimuth = np.arange(AREA_SECTORS) * (2 * np.pi / AREA_SECTORS)
-    rays = unit_vectors(*np.meshgrid(cosine, azimuth, indexing="ij")).reshape(-1, 3)
+    rays = unit_vectors(cosine[:, None], azimuth).reshape(-1, 3)
     place_m = surface.meet(np.zeros(3), rays)
     met = np.isfinite(place_m[:, 0])
     place_m = place_m[met]

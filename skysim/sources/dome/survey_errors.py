@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD, PPM
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, normalized
+from skysim.core.types import Floats, azimuths_rad, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
 from skysim.sources.dome.surface import Surface
@@ -57,7 +57,7 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
             "a place away from the LEDs",
         )
     return (
-        np.arctan2(sight_m[:, 1], sight_m[:, 0]),
+        azimuths_rad(sight_m),
         np.arctan2(level_m, sight_m[:, 2]),
         distance_m,
     )

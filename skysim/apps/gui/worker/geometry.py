@@ -10,7 +10,17 @@ from estimator.core.camera import Camera
 from skysim.apps.gui.messages import Lens, Pose, Triple
 from skysim.core import quaternion
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Ints, Record, Sources, Trajectory, Truth
+from skysim.core.types import (
+    UP,
+    Bools,
+    Floats,
+    Ints,
+    Record,
+    Sources,
+    Trajectory,
+    Truth,
+    grid_points,
+)
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, brightest
 from skysim.results import scoring
@@ -73,19 +83,18 @@ def views(lab: Lab, model: multibody.Laboratory) -> dict[str, tuple[Any, ...]]:
     the vertical field of view, deg; and whether it is on the vehicle.
     """
     mount = lab.camera.mount
-    body_from_cam = mount.cam_from_body.inv()
+    body_from_cam = mount.body_from_cam
     pupil_m = mount.camera_body_m
     height_m = np.linalg.norm(model.eye_m - model.target_m)
     field_deg = lab.scene.camera.calibration().field_deg[1]
-    up = np.array([0.0, 0.0, 1.0])
     north = np.array([0.0, 1.0, 0.0])
-    ahead = body_from_cam.apply([0.0, 0.0, 1.0])
+    ahead = body_from_cam.apply(UP)
     above = body_from_cam.apply([0.0, -1.0, 0.0])
     return {
-        "outside": (model.eye_m, model.target_m, up, FOVY_DEG, False),
+        "outside": (model.eye_m, model.target_m, UP, FOVY_DEG, False),
         "camera": (pupil_m, pupil_m + ahead, above, field_deg, True),
-        "bearing": (np.zeros(3), up, north, WIDE_DEG, False),
-        "top": (model.target_m + height_m * up, model.target_m, north, FOVY_DEG, False),
+        "bearing": (np.zeros(3), UP, north, WIDE_DEG, False),
+        "top": (model.target_m + height_m * UP, model.target_m, north, FOVY_DEG, False),
     }
 
 
@@ -99,7 +108,7 @@ def lens_of(camera: Camera) -> Lens:
     """Tables of the tangents x / z and y / z of a camera's pixels, from the upper left to the lower right corner."""
     x = np.linspace(-0.5, camera.width_px - 0.5, NODES)
     y = np.linspace(-0.5, camera.height_px - 0.5, NODES)
-    tangents = camera.tangents(np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2))
+    tangents = camera.tangents(grid_points(x, y))
     return Lens(NODES, *tangents.T.copy())
 
 

@@ -19,7 +19,7 @@ from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
 from skysim.camera.render import Window
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Ints, Trajectory, taken
+from skysim.core.types import Floats, Ints, Trajectory, homogeneous, taken
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
@@ -73,7 +73,7 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, optics, poses, ends)
     rate_e_s = rates_e_s(near, optics, camera.known.emitter, distance_m, cos_out, cos_in)
-    duty = np.minimum(near.on_s / near.period_s, 1.0)
+    duty = near.duty
     electrons = rate_e_s * duty * lab.scene.exposure.time_s
     x, y = xy_px.T
     width_px, height_px = camera.canvas.shape[::-1]
@@ -122,7 +122,7 @@ def simulate_detections(
     false = trial.false_lights + round(
         len(detected) * trial.false_share / (1 - trial.false_share)
     )
-    false_px = rng.random((false, 2)) * [scene.camera.width_px, scene.camera.height_px] - 0.5
+    false_px = rng.random((false, 2)) * scene.camera.size_px - 0.5
     if len(flux):
         false_flux = flux[rng.integers(len(flux), size=false)]
     else:
@@ -141,7 +141,7 @@ def with_direction_noise(
     The error of the tangents, times the focal length, is added: it is that of an undistorted lens.
     """
     focal_px = scene.camera.focal_px
-    rays = np.column_stack([(xy_px - scene.camera.center_px) / focal_px, np.ones(len(xy_px))])
+    rays = homogeneous((xy_px - scene.camera.center_px) / focal_px, 1.0)
     lengths = np.linalg.norm(rays, axis=1, keepdims=True)
     moved = rays + sigma_rad * lengths * rng.standard_normal(rays.shape)
     return xy_px + focal_px * (moved[:, :2] / moved[:, 2:] - rays[:, :2])
@@ -192,5 +192,5 @@ def brightness(lab: Lab, rows: Ints, frame: int) -> Floats:
     shown = dome.pulsed(dome.sources, lab.camera.run_seed, frame, window, middle_s).take(rows)
     pulses = np.column_stack([shown.period_s, shown.start_s, shown.on_s]).tolist()
     lit_s = np.array([lit_moments_s(begin_s, end_s, *one)[0] for one in pulses])
-    mean = steady.strength * np.minimum(steady.on_s / steady.period_s, 1.0)
+    mean = steady.strength * steady.duty
     return shown.strength * lit_s / window.exposure_s / mean

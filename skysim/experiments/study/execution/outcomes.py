@@ -16,7 +16,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Telemetry, Truth, frozen
+from skysim.core.types import UP, Floats, Telemetry, Truth, frozen
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg, saturated_s
 from skysim.simulation.lab import Lab
@@ -277,7 +277,7 @@ def claimed_image_px(
     if isinstance(estimator, DomeTracker):
         rows = rows_of(estimator.leds.id[match.star], lab.camera.sources.id)
         camera_m = quaternion.apply(lab_from_body, lab.camera.mount.camera_body_m)
-        offset_lab = lab.camera.sources.place[rows, :3] - camera_m
+        offset_lab = lab.camera.sources.xyz[rows] - camera_m
     else:
         assert isinstance(estimator, StarTracker)
         offset_lab = estimator.stars.vectors[match.star]
@@ -339,7 +339,7 @@ def directions(lab: Lab, lab_from_body: Floats, cam_from_lab: Floats) -> dict[st
     values = dict(zip(DIRECTION[:4], lab_from_body.tolist(), strict=True))
     dome = lab.scene.dome
     turn = lab_from_body if dome else quaternion.inverse(cam_from_lab)
-    x, y, z = quaternion.apply(turn, np.array([0.0, 0.0, 1.0])).tolist()
+    x, y, z = quaternion.apply(turn, UP).tolist()
     around_deg = math.degrees(math.atan2(y, x)) % 360
     across = math.hypot(x, y)
     if dome:

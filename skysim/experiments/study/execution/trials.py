@@ -519,7 +519,7 @@ def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
     camera = setup.lab.in_run(int(noise.integers(2**62))).camera
     middle, axis_cam = attitude_and_axis(setup, attitude_rng)
     rate_cam = math.radians(trial.rate_deg_s) * axis_cam
-    body_from_cam = camera.mount.cam_from_body.inv()
+    body_from_cam = camera.mount.body_from_cam
     rate_body, turn_body, acceleration_body = (
         body_from_cam.apply(math.radians(value) * axis_cam)
         for value in (trial.rate_deg_s, trial.turn_deg, trial.acceleration_deg_s2)

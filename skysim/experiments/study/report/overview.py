@@ -164,9 +164,7 @@ def trial_rate_rad_s(trial: Trial, lab: Lab) -> Floats | None:
         return np.zeros(3)
     # For a random axis, one between the camera's x and y is taken: a rolling shutter then both shears and stretches.
     axis_cam = rate_axis(trial.rate_axis, math.pi / 4, lab.camera.mount)
-    return lab.camera.mount.cam_from_body.inv().apply(
-        math.radians(trial.rate_deg_s) * axis_cam
-    )
+    return lab.camera.mount.body_from_cam.apply(math.radians(trial.rate_deg_s) * axis_cam)
 
 
 def checked_points(plan: Plan) -> Iterator[tuple[str, Point]]:

@@ -26,7 +26,7 @@ from scipy.spatial import KDTree
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints, normalized
+from skysim.core.types import Floats, Ints, lengths, normalized, positive
 
 
 class Fields(NamedTuple):
@@ -106,7 +106,7 @@ def fields_about(
     place_m: Floats, height_m: float, tilt_rad: float, radius_rad: float, coincidence_m: float
 ) -> Fields:
     """The neighbors of every LED within the tilt, as seen with that LED on the boresight (step 1)."""
-    range_m = np.linalg.norm(place_m, axis=1)
+    range_m = lengths(place_m)
     up = place_m / range_m[:, None]
     center = np.flatnonzero(up[:, 2] >= math.cos(tilt_rad))
     # Image axes: x = y_lab x boresight, which is defined because the tilt stays below 90 deg.
@@ -114,7 +114,7 @@ def fields_about(
     x_m = across @ place_m.T
     y_m = np.cross(up[center], across) @ place_m.T
     ahead_m = up[center] @ place_m.T - height_m
-    radius = np.hypot(x_m, y_m) / np.where(ahead_m > 0, ahead_m, np.nan)
+    radius = np.hypot(x_m, y_m) / positive(ahead_m)
     # The center LED is not its own neighbor.
     radius[np.arange(len(center)), center] = np.nan
     row, led = np.nonzero(radius <= math.tan(radius_rad))

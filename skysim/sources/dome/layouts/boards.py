@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, normalized
+from skysim.core.types import UP, Floats, lengths, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import HOLES, PatchBoardsConfig
 from skysim.sources.dome.layouts.placing import (
@@ -93,7 +93,7 @@ def spread_boards(
     """
     half = np.radians(config.cap_deg)
     spacing_m = config.spacing_m or config.pitch_m
-    apex_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))[0, 2]
+    apex_m = project_from_bearing(surface, UP[None])[0, 2]
     if config.spread == "grid":
         directions = grid(spacing_m / apex_m, half)
         rotation = np.zeros(len(directions))
@@ -168,7 +168,7 @@ def tangent_boards(surface: Surface, center_m: Floats, rotation_rad: Floats) -> 
     normal = surface.inward(center_m)
     across = np.cross(normal, [1.0, 0.0, 0.0])
     # The normal is parallel to lab x.
-    edge_on = np.linalg.norm(across, axis=1) < 1e-9
+    edge_on = lengths(across) < 1e-9
     across[edge_on] = [0.0, 1.0, 0.0]
     across = normalized(across)
     along = np.cross(normal, across)

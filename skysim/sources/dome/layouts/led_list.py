@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from skysim.core.types import Floats, Sources
+from skysim.core.types import Floats, Sources, azimuths_rad
 from skysim.scene.sections.layouts import StringConfig
 from skysim.scene.sections.light import DomeConfig
 from skysim.sources.dome.display import ideal_led
@@ -33,10 +33,10 @@ def led_list(config: DomeConfig, band: Band, name: str) -> tuple[str, int]:
     of the drive, without the scatter from LED to LED.
     """
     leds = design_leds(config, build_surface(config.surface), band)
-    place_m = leds.place[:, :3]
+    place_m = leds.xyz
     full = full_strength_e_s_sr(ideal_led(config.led), band)
     level = leds.strength / max(full, float(leds.strength.max()))
-    azimuth_deg = np.degrees(np.arctan2(place_m[:, 1], place_m[:, 0])) % 360
+    azimuth_deg = np.degrees(azimuths_rad(place_m)) % 360
     tilt_deg = np.degrees(tilts_rad(place_m))
     columns = {"id": [f"{number}" for number in leds.id]}
     for n, axis in enumerate("xyz"):

@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from skysim.core.errors import InputError, Where
 from skysim.core.text import cells_of, column_numbers, read_lines
-from skysim.core.types import Floats, normalized
+from skysim.core.types import Floats, lengths, normalized
 from skysim.scene.sections.layouts import MAX_LEDS, ListedConfig, relative_levels
 from skysim.sources.dome.layouts.placing import (
     Ints,
@@ -76,7 +76,7 @@ def listed(config: ListedConfig, surface: Surface, _rng: Generator) -> PlacedLed
     apart = thin(directions, SAME_PLACE if config.file else 1e-6)
     if len(apart) < len(directions):
         second = np.setdiff1d(np.arange(len(directions)), apart)[0]
-        first = np.linalg.norm(directions[:second] - directions[second], axis=1).argmin()
+        first = lengths(directions[:second] - directions[second]).argmin()
         raise InputError(keys[second], f"at the place of {keys[first]}", "each LED once")
     check_cap(keys, directions, config.cap_deg)
     place_m = coordinates if are_places else project_from_bearing(surface, directions)
@@ -91,7 +91,7 @@ def check_on_surface(keys: Sequence[str], surface: Surface, place_m: Floats) -> 
     """Raise InputError for the first LED that is too far from the surface, along the ray from the bearing."""
     # Written so that NaN is too far.
     directions = normalized(place_m)
-    offset_m = np.linalg.norm(project_from_bearing(surface, directions) - place_m, axis=1)
+    offset_m = lengths(project_from_bearing(surface, directions) - place_m)
     far = np.flatnonzero(~(offset_m <= MAX_SURFACE_OFFSET_M))
     if len(far):
         raise InputError(

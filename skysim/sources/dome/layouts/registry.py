@@ -11,7 +11,7 @@ import numpy as np
 from numpy.random import Generator
 
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Sources
+from skysim.core.types import Floats, Sources
 from skysim.scene.sections.layouts import (
     HOLES,
     CelestialConfig,
@@ -31,7 +31,7 @@ from skysim.sources.dome.display import (
 )
 from skysim.sources.dome.layouts.boards import patch_boards
 from skysim.sources.dome.layouts.listed import listed
-from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, led_sources
+from skysim.sources.dome.layouts.placing import Ints, PlacedLeds, dimmed, led_sources
 from skysim.sources.dome.layouts.spreads import (
     fibonacci,
     geodesic,
@@ -46,12 +46,18 @@ from skysim.sources.photometry import Band
 LayoutFunction = Callable[[Any, Surface, LedConfig, Band], Sources]
 
 
-def fitted(place: Callable[[Any, Surface, Generator], PlacedLeds]) -> LayoutFunction:
-    """The layout of the LEDs that a function places; all draws are from one stream of the hardware."""
+def fitted(place: Callable[[Any, Surface, Generator], PlacedLeds | Floats]) -> LayoutFunction:
+    """The layout of the LEDs that a function places; all draws are from one stream of the hardware.
+
+    LEDs of which it gives the places alone (N, 3) are `dimmed` by the layout's section.
+    """
 
     def layout(config: Any, surface: Surface, led: LedConfig, band: Band) -> Sources:
         rng = random_stream(config.hardware_seed)
-        return led_sources(place(config, surface, rng), led, band, rng)
+        placed = place(config, surface, rng)
+        if not isinstance(placed, PlacedLeds):
+            placed = dimmed(config, surface, placed, rng)
+        return led_sources(placed, led, band, rng)
 
     return layout
 

@@ -10,7 +10,7 @@ from scipy.spatial import ConvexHull
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, around_z, normalized
+from skysim.core.types import Floats, around_z, azimuths_rad, normalized
 from skysim.scene.sections.layouts import (
     FibonacciConfig,
     GeodesicConfig,
@@ -20,9 +20,7 @@ from skysim.scene.sections.layouts import (
 )
 from skysim.sources.dome.layouts import optimize
 from skysim.sources.dome.layouts.placing import (
-    PlacedLeds,
     cap,
-    dimmed,
     project_from_bearing,
     scattered_cap,
     spread,
@@ -43,19 +41,18 @@ BISECTIONS = 14  # bisection steps from the dome's width: to some tenths of a mi
 # Arguments: the layout's section of the scene, the surface, and the hardware's random stream.
 
 
-def fibonacci(config: FibonacciConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def fibonacci(config: FibonacciConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs on a Fibonacci spiral: equal solid angles about the bearing contain equal numbers, to within a few."""
-    place_m = project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
-    return dimmed(config, surface, place_m, rng)
+    return project_from_bearing(surface, cap(config.count, np.radians(config.cap_deg)))
 
 
-def random_places(config: RandomPlacesConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def random_places(config: RandomPlacesConfig, surface: Surface, rng: Generator) -> Floats:
     """Independent LEDs, uniform in solid angle about the bearing: a Poisson field, like that of real stars."""
     directions = scattered_cap(config.count, np.radians(config.cap_deg), rng)
-    return dimmed(config, surface, project_from_bearing(surface, directions), rng)
+    return project_from_bearing(surface, directions)
 
 
-def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at random with a least spacing, as many as fit: random sequential adsorption.
 
     Random points, uniform over the cap, are taken in turn; each is accepted if no accepted one is within the spacing.
@@ -78,7 +75,7 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) ->
             surface, scattered_cap(DARTS_PER_LED * count, half, rng)
         )
         chosen = spread(darts_m, 0.0, count, BISECTIONS)
-        return dimmed(config, surface, darts_m[chosen], rng)
+        return darts_m[chosen]
     directions = cap(1000, half)
     points = project_from_bearing(surface, directions)
     # Surface area per steradian seen from the bearing, r^2 / cos(incidence). Where it is greatest, points uniform in
@@ -97,10 +94,10 @@ def poisson_disk(config: PoissonDiskConfig, surface: Surface, rng: Generator) ->
             f"{min_spacing_m:.3g} m or more",
         )
     darts_m = project_from_bearing(surface, scattered_cap(max(int(dart_count), 1), half, rng))
-    return dimmed(config, surface, darts_m[thin(darts_m, config.spacing_m)], rng)
+    return darts_m[thin(darts_m, config.spacing_m)]
 
 
-def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at the places that make the camera's worst attitudes most accurate: `optimize.optimize_places`.
 
     No LED is placed where no attitude's field reaches. In the mean of the worst attitudes the layout is not worse
@@ -119,7 +116,7 @@ def optimized(config: OptimizedConfig, surface: Surface, rng: Generator) -> Plac
     place_m, state = optimized_places(config_of_places, *points)
     # The random stream goes on as if the search had not been cached.
     rng.bit_generator.state = state
-    return dimmed(config, surface, place_m, rng)
+    return place_m
 
 
 # A search takes seconds; a study's trials, its costs and its report ask for the same places.
@@ -158,17 +155,16 @@ def optimized_places(
 CAP_SLACK = 1e-12  # relative rounding error of a vertex on the rim of the cap
 
 
-def geodesic(config: GeodesicConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def geodesic(config: GeodesicConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs at the geodesic vertices within the cap, numbered from the zenith, then by azimuth."""
     vertices = geodesic_vertices(config.frequency, config.class_)
     tilt_rad = tilts_rad(vertices)
-    azimuth_rad = np.arctan2(vertices[:, 1], vertices[:, 0])
+    azimuth_rad = azimuths_rad(vertices)
     # Rounded, so that vertices of equal tilt are in the order of their azimuths.
     order = np.lexsort((np.round(azimuth_rad, 9), np.round(tilt_rad, 9)))
     order = order[tilt_rad[order] <= np.radians(config.cap_deg) * (1 + CAP_SLACK)]
     turned = azimuth_rad[order] + np.radians(config.rotation_deg)
-    place_m = project_from_bearing(surface, directions(tilt_rad[order], turned))
-    return dimmed(config, surface, place_m, rng)
+    return project_from_bearing(surface, directions(tilt_rad[order], turned))
 
 
 def geodesic_vertices(frequency: int, class_: str) -> Floats:

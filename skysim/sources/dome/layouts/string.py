@@ -22,10 +22,10 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats, Ints, Sources, normalized
+from skysim.core.types import UP, Floats, Ints, Sources, lengths, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
-from skysim.sources.dome.layouts.placing import PlacedLeds, dimmed, project_from_bearing
+from skysim.sources.dome.layouts.placing import project_from_bearing
 from skysim.sources.dome.surface import Surface, directions, perpendicular
 
 STEPS_PER_TURN = 720
@@ -88,9 +88,9 @@ class Wound(NamedTuple):
     tape_m: Floats
 
 
-def string(config: StringConfig, surface: Surface, rng: Generator) -> PlacedLeds:
+def string(config: StringConfig, surface: Surface, rng: Generator) -> Floats:
     """LEDs of tapes, one every pitch along the surface. Raises InputError for too long a tape."""
-    return dimmed(config, surface, wind(config, surface).place_m, rng)
+    return wind(config, surface).place_m
 
 
 def wind(config: StringConfig, surface: Surface) -> Wound:
@@ -99,7 +99,7 @@ def wind(config: StringConfig, surface: Surface) -> Wound:
     tapes = WINDINGS[config.winding](config, surface, meridian)
     # A cap that is too small for a tape has one LED at the zenith.
     if not tapes:
-        zenith_m = project_from_bearing(surface, np.array([[0.0, 0.0, 1.0]]))
+        zenith_m = project_from_bearing(surface, UP[None])
         return Wound(zenith_m, np.zeros(1, np.int64), np.zeros(1))
     # As many as fit; on a ring the last has a pitch to the first.
     fit = [int(tape.length_m[-1] / config.pitch_m) for tape in tapes]
@@ -236,7 +236,7 @@ def lay(
 ) -> Tape:
     """A tape along (K,) directions from the bearing, with its length along the surface to each."""
     place_m = project_from_bearing(surface, directions(tilt_rad, azimuth_rad))
-    steps_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    steps_m = lengths(np.diff(place_m, axis=0))
     return Tape(tilt_rad, azimuth_rad, np.append(0, np.cumsum(steps_m)), closed)
 
 
@@ -262,10 +262,10 @@ def displace_ends(config: FibersConfig, surface: Surface, fibers: Sources) -> So
     50 mm off: 34"). Normals are those of the design. The random stream is that of config.points.hardware_seed.
     """
     seed = config.points.hardware_seed
-    place_m = fibers.place[:, :3]
+    place_m = fibers.xyz
     drawn = random_stream(seed, SHELL_STREAM).uniform(-1, 1, len(fibers))
     fraction = config.radius_variation * drawn
-    outward_m = fraction * np.linalg.norm(place_m, axis=1)
+    outward_m = fraction * lengths(place_m)
     if config.aiming is None:
         moved = place_m - outward_m[:, None] * fibers.normal
     else:
