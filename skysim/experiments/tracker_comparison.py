@@ -9,8 +9,9 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Frame, FrameRow, Record, Truth
+from skysim.core.types import Frame, Record, Truth
 from skysim.results import metrics, scoring
+from skysim.results.scoring import FrameRow
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
 from skysim.simulation.lab import Lab, build_tracker

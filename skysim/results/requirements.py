@@ -18,8 +18,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import FrameRow
 from skysim.results import metrics
+from skysim.results.scoring import FrameRow
 from skysim.simulation.checks.facts import REQUIREMENTS, Fact
 
 MORE = ("identified", "coverage", "right_within")  # proportions of which more is better

@@ -17,7 +17,6 @@ from skysim.core.files import make_folder, write_image, write_table
 from skysim.core.types import (
     Floats,
     Frame,
-    FrameRow,
     Record,
     Telemetry,
     Trajectory,
@@ -29,7 +28,7 @@ from skysim.results import requirements, run_report, scoring, telemetry_report
 from skysim.results.files.recording import remove_results, write_frame
 from skysim.results.plots import annotate_truth
 from skysim.results.report import Report
-from skysim.results.scoring import Score, image_tag
+from skysim.results.scoring import FrameRow, Score, image_tag
 from skysim.scene.scene import Scene, check_scene
 from skysim.simulation.checks import Check, check
 from skysim.simulation.exposure import render_frame

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from estimator.identification import refusals as reasons
-from skysim.core.types import FrameRow, Record
+from skysim.core.types import Record
 from skysim.results import metrics, scoring
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import (
@@ -28,6 +28,7 @@ from skysim.results.report import (
     text_column,
 )
 from skysim.results.requirements import NOT_MET, Judgment
+from skysim.results.scoring import FrameRow
 from skysim.scene.scene import Scene
 from skysim.simulation.checks import Check
 from skysim.tracking.computer_time import computer_text

@@ -13,13 +13,69 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Frame, FrameRow, Record, Truth
+from skysim.core.types import Frame, Record, Truth, frozen
 from skysim.results import metrics
 from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Shot
 from skysim.simulation.lab import StarCamera
+
+
+@frozen
+class FrameRow:
+    """One frame of a run for the report: angles in degrees, errors in arcseconds, times in ms.
+
+    Attributes
+    ----------
+    truth_deg, estimate_deg
+        (RA, Dec, roll) of the camera under the stars, (roll, pitch, yaw) of the vehicle under the dome
+    wrong
+        Whether the solution has an error of more than ten arcminutes and of more than the tracker claims
+        (`metrics.is_wrong`)
+    filter
+        Status of the attitude filter's update with the solution; empty without a filter
+    cross_sigma_arcsec, roll_sigma_arcsec
+        Standard deviations that the tracker claims
+    log10_chance
+        Logarithm of the probability that its matches are chance
+    rate_error_deg_s
+        Length of the tracker's angular rate of the camera minus the truth; with the nearer of the two signs if the
+        tracker does not know the sign
+    rate_sigma_deg_s
+        Standard deviation that the tracker claims for the rate
+    magnitude_error_mag, magnitude_sigma_mag
+        Mean and standard deviation of measured minus catalog magnitude of its stars; NaN of LEDs
+    nees
+        Squared error over the claimed covariance; 3 on average if the claim is true
+    survey_share
+        Share of the claimed variance by errors of the survey, which all frames have in common
+    """
+
+    frame: int
+    t_s: float
+    rate_deg_s: float
+    status: str
+    truth_deg: tuple[float, float, float]
+    estimate_deg: tuple[float, float, float] | None
+    cross_arcsec: float
+    roll_arcsec: float
+    detected: int
+    matched: int
+    rms_px: float
+    time_ms: float
+    wrong: bool
+    filter: str = ""
+    cross_sigma_arcsec: float = math.nan
+    roll_sigma_arcsec: float = math.nan
+    log10_chance: float = math.nan
+    exposure_s: float = math.nan
+    rate_error_deg_s: float = math.nan
+    rate_sigma_deg_s: float = math.nan
+    magnitude_error_mag: float = math.nan
+    magnitude_sigma_mag: float = math.nan
+    nees: float = math.nan
+    survey_share: float = math.nan
 
 
 def angle_names(scene: Scene) -> tuple[str, str, str]:

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from skysim.apps.gui.messages import Detection, TrackerResult
-from skysim.core.types import FrameRow
+from skysim.results.scoring import FrameRow
 
 
 def solution(

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skysim.core.types import FrameRow
 from skysim.results.run_report import claims_text, summary
+from skysim.results.scoring import FrameRow
 
 
 def row(cross: float, roll: float, nees: float, share: float) -> FrameRow:

@@ -8,9 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, Centroids, StarMatch
 from estimator.trackers.pipeline import Report
-from skysim.core.types import FrameRow
 from skysim.results.run_report import magnitude_errors, magnitude_text, refusals, summary
-from skysim.results.scoring import magnitude_errors_mag
+from skysim.results.scoring import FrameRow, magnitude_errors_mag
 
 
 def report(flux: list[float], v_mag: list[float] | None, observed: list[int]) -> Report:

@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Floats, FrameRow, Ints, Record, frozen
+from skysim.core.types import Floats, Ints, Record, frozen
 from skysim.results import plots
+from skysim.results.scoring import FrameRow
 from skysim.scene.scene import Scene
 
 Triple = tuple[float, float, float]

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from skysim.apps.cli import terminal
-from skysim.core.types import FrameRow
 from skysim.experiments.tracker_comparison import TrackerScore
 from skysim.results import report as as_text
 from skysim.results.metrics import Summary
 from skysim.results.report import Report
 from skysim.results.run_report import frame_table, motion_section, run_report
+from skysim.results.scoring import FrameRow
 from skysim.scene import loader
 from skysim.simulation.checks import Check
 

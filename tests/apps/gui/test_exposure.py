@@ -14,13 +14,12 @@ from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
-    chosen,
     come,
     exported,
+    open_scene,
     opened,
     pictured,
     screen,
-    status,
 )
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
@@ -40,9 +39,7 @@ def test_the_brightest_light_is_compared_with_the_full_well(
     detector = loader.load(name).camera.detector
     with opened(browser, server.login, NARROW) as page:
         if name != "shefex2":
-            chosen(page, "Scene", name)
-            page.get_by_text("AFIT SimSat under its measured dome").wait_for()
-            status(page, "solved")
+            open_scene(page, name)
         plot = page.locator(".lab-plot")
         told = re.compile(r"brightest pixel of (\d+) lights (\d+) of (\d+) electrons")
         assert come(lambda: told.search(str(plot.get_attribute("aria-label"))) is not None)

@@ -16,12 +16,11 @@ from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
-    chosen,
     come,
+    open_scene,
     opened,
     panel,
     pictured,
-    status,
 )
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
@@ -185,9 +184,7 @@ def test_a_watched_folder_is_compared_with_the_simulation(
         Server(tmp_path, "--camera", str(shots)) as watching,
         opened(browser, watching.login, NARROW) as page,
     ):
-        chosen(page, "Scene", DOME)
-        page.get_by_text("AFIT SimSat under its measured dome").wait_for()
-        status(page, "solved")
+        open_scene(page, DOME)
         panel(page, "Image")
         page.get_by_role("checkbox", name="as the scene's camera").click()
         page.get_by_role("button", name="Watch").click()

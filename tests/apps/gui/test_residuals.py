@@ -12,15 +12,14 @@ from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
-    chosen,
     come,
     differs,
+    open_scene,
     opened,
     panel,
     picture,
     pictured,
     simulate,
-    status,
 )
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
@@ -115,9 +114,7 @@ def test_arrows_are_drawn_over_the_frame_and_over_the_dome(
     server: Server,
 ) -> None:
     with opened(browser, server.login, NARROW) as page:
-        chosen(page, "Scene", "afit_simsat")
-        page.get_by_text("AFIT SimSat under its measured dome").wait_for()
-        status(page, "solved")
+        open_scene(page, "afit_simsat")
         canvas = page.locator(".lab-frame > canvas")
         box = {name: int(value) for name, value in canvas.bounding_box().items()}
         corners = box["x"], box["y"], box["x"] + box["width"], box["y"] + box["height"]

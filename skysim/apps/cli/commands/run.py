@@ -34,8 +34,9 @@ from skysim.apps.cli.options import (
 )
 
 if TYPE_CHECKING:
-    from skysim.core.types import FrameRow, Record
+    from skysim.core.types import Record
     from skysim.results.report import Report
+    from skysim.results.scoring import FrameRow
     from skysim.scene.scene import Scene
     from skysim.simulation.checks import Check
 

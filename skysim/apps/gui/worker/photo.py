@@ -41,13 +41,14 @@ from skysim.core import images
 from skysim.core.errors import InputError
 from skysim.core.images import TOP_DOWN_CARD
 from skysim.core.paths import PAPERS, SCENES
-from skysim.core.types import FrameRow, Record, frozen
+from skysim.core.types import Record, frozen
 from skysim.core.yaml_reader import VERSION, set_key
 from skysim.experiments.study import study_file
 from skysim.experiments.study.execution import runner, store, trials
 from skysim.results import plots, scoring
 from skysim.results.files import recording
 from skysim.results.plots import annotate
+from skysim.results.scoring import FrameRow
 from skysim.scene.loader import find
 
 
