@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import math
 import shutil
+import signal
 import tempfile
 import time
 from collections.abc import Collection, Mapping
@@ -27,6 +28,8 @@ def pytest_configure(config: pytest.Config) -> None:
     it took from other files: stale machine code answers wrongly, or crashes where a tuple's fields have moved. The
     two packages do not call each other's compiled code. Workers of xdist start after their controller has cleaned.
     """
+    # A shell's background job ignores Ctrl-C, and so would all that the tests start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     if hasattr(config, "workerinput"):
         return
     for package in (ROOT / "skysim", ROOT / "estimator"):

@@ -1,10 +1,8 @@
 """Errors for the user, text that is safe to print on a terminal, and interrupts that are not lost."""
 
-import math
 import os
 import signal
 import sys
-import time
 import weakref
 from collections.abc import Callable, Collection, Iterable
 from pathlib import Path
@@ -175,19 +173,8 @@ def stop(*_: object) -> None:
     os._exit(130)
 
 
-interrupted_s = -math.inf  # time of the last interrupt
-
-
-def repeat_lost_interrupt() -> None:
-    """For loops that may never end: raise an interrupt again that has not ended them for a second."""
-    if 1.0 < time.monotonic() - interrupted_s < 5.0:
-        raise KeyboardInterrupt
-
-
 def interrupt(_: int, frame: FrameType | None) -> None:
     """Handler: raise KeyboardInterrupt here, or if a function on the stack would lose it, in that function's caller."""
-    global interrupted_s
-    interrupted_s = time.monotonic()
     caller = None
     while frame is not None:
         if loses_exceptions(frame.f_code):

@@ -42,10 +42,10 @@ def test_a_compressed_image_is_decoded(tmp_path: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("key", "value", "message"),
     [
-        ("ZNAXIS1", 75, "not a complete FITS file: "),  # malloc(): invalid size
-        ("ZNAXIS2", 30, "not a complete FITS file: "),
+        ("ZNAXIS1", 75, "not a complete FITS file"),  # malloc(): invalid size
+        ("ZNAXIS2", 30, "not a complete FITS file"),
         ("TFIELDS", 2**31 - 1, "TFIELDS 2147483647; allowed: up to 999 columns"),
-        ("ZNAXIS", 2**31 - 1, "not a complete FITS file: "),
+        ("ZNAXIS", 2**31 - 1, "not a complete FITS file"),
         ("ZNAXIS2", 2**31 - 1, "2147483647x80 pixels by its header"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import subprocess
@@ -300,12 +299,3 @@ def test_processes_killed_at_the_start_of_a_pool_end_it_in_one_line_or_not_at_al
         assert sorted(row.trial for row in rows) == list(range(40))
         assert [row.error for row in rows if row.error] == []
     assert killed.is_set()
-
-
-def test_an_interrupt_that_was_lost_is_raised_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By a loop that may never end, a second later: an exception in a callback of compiled code ends there."""
-    begin_s = time.monotonic()
-    for age_s, is_raised in ((0.5, False), (2.0, True), (10.0, False)):
-        monkeypatch.setattr(errors, "interrupted_s", begin_s - age_s)
-        with pytest.raises(KeyboardInterrupt) if is_raised else contextlib.nullcontext():
-            errors.repeat_lost_interrupt()

@@ -613,7 +613,7 @@ def test_a_frame_s_covariances_are_those_of_the_body() -> None:
         shot(3.0, **solved, match=SimpleNamespace(star=np.array([1, 3]))),
     ]
     camera = SimpleNamespace(
-        mount=SimpleNamespace(cam_from_body=cam_from_body), sources=range(5)
+        mount=SimpleNamespace(body_from_cam=cam_from_body.inv()), sources=range(5)
     )
     flight: Any = SimpleNamespace(
         lab=SimpleNamespace(camera=camera), shots=lambda cameras, progress: shots

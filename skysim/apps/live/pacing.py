@@ -39,7 +39,7 @@ from skysim.apps.live.packets import (
     solution_packet,
     values_of,
 )
-from skysim.core.errors import InputError, repeat_lost_interrupt
+from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Trajectory
 from skysim.simulation.flight import Flight, Shot
@@ -157,7 +157,6 @@ class Live:
         try:
             self.pace.start(0.0)
             while not self.flight.is_over and not self.is_abandoned:
-                repeat_lost_interrupt()
                 self.advance()
             self.send_frames(late=True)
         finally:
@@ -339,7 +338,6 @@ class PosedLive(Live):
         self.warm_up()
         self.pace.start(0.0)
         while not self.flight.schedules[0].is_over and not self.is_abandoned:
-            repeat_lost_interrupt()
             for command, reply in self.inbox.take():
                 try:
                     if set(command) != {"pose"}:

@@ -36,7 +36,7 @@ COLORS = {
     "identified": "#6ff0d8",
     "false": "#e8b90f",
     "windows": "#7f8a9a",
-    "residuals": "#dede70",
+    "residuals": "#70c0f0",
 }
 KINDS = tuple(COLORS)
 KIND_BY_MARK = {kind: kind for kind in KINDS} | {"faint": "truth"}

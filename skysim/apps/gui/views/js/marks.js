@@ -103,7 +103,7 @@ export function arrowScale(lengths, wanted) {
 }
 
 // Residuals [x, y, along x, along y] as arrows, and their scale at the lower edge, which is returned. wide: of the frame
-const ARROW = "#dede70", SHORTENED = "#ffab1a", HEAD = 4, SHARE = 0.025; // least median arrow over the frame's width
+const ARROW = "#70c0f0", SHORTENED = "#ffab1a", HEAD = 4, SHARE = 0.025; // least median arrow over the frame's width
 export function drawArrows(pen, residuals, wide, toScreen, [, height]) {
   const lengths = residuals.map(([, , dx, dy]) => Math.hypot(dx, dy));
   const { factor, longest, text } = arrowScale(lengths, SHARE * wide);
