@@ -157,7 +157,9 @@ def without_times(tree: Any) -> Any:
     """A tree of JSON without the keys of computation times."""
     if isinstance(tree, dict):
         return {
-            key: without_times(one) for key, one in tree.items() if not key.endswith("_ms")
+            key: without_times(one)
+            for key, one in tree.items()
+            if not key.endswith("_ms") and key not in ("timing", "times_s")  # of a datasheet
         }
     return [without_times(one) for one in tree] if isinstance(tree, list) else tree
 
