@@ -38,9 +38,12 @@ def test_the_brightest_light_is_compared_with_the_full_well(
 ) -> None:
     detector = loader.load(name).camera.detector
     with opened(browser, server.login, NARROW) as page:
-        if name != "shefex2":
-            open_scene(page, name)
         plot = page.locator(".lab-plot")
+        if name != "shefex2":
+            before = plot.get_attribute("aria-label")
+            open_scene(page, name)
+            # The plot follows the picture.
+            assert come(lambda: plot.get_attribute("aria-label") != before)
         told = re.compile(r"brightest pixel of (\d+) lights (\d+) of (\d+) electrons")
         assert come(lambda: told.search(str(plot.get_attribute("aria-label"))) is not None)
         count, most, full = map(int, told.search(plot.get_attribute("aria-label")).groups())
