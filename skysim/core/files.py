@@ -6,6 +6,7 @@ import os
 import platform
 import re
 import shutil
+import warnings
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -200,6 +201,7 @@ MAX_HEADER_LINES = 5000  # of an ECSV table; a map's has some hundred
 def read_table(path: Path) -> Any:
     """The astropy table in an ECSV file. Raises InputError if the file is not valid ECSV, with the first bad line."""
     from astropy.table import Table
+    from astropy.utils.exceptions import AstropyWarning
 
     lines = read_lines(path)
     # Before it is parsed, which takes a second for a thousand lines.
@@ -209,7 +211,12 @@ def read_table(path: Path) -> Any:
 
     def parse(some: list[Line]) -> Any:
         try:
-            return Table.read([line for _, line in some], format="ascii.ecsv")
+            # They warn of unknown types in the header, and of numbers beyond their type.
+            with (
+                warnings.catch_warnings(action="error", category=AstropyWarning),
+                warnings.catch_warnings(action="error", category=RuntimeWarning),
+            ):
+                return Table.read([line for _, line in some], format="ascii.ecsv")
         except Exception as error:  # astropy's parsers raise many types
             return error
 

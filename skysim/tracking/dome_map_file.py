@@ -91,10 +91,7 @@ def write_dome_map(path: Path, dome: DomeMap) -> None:
 
 def read_dome_map(path: Path) -> DomeMap:
     """The dome map in a file that `write_dome_map` wrote. Raises InputError for any other file."""
-    import warnings
-
-    with warnings.catch_warnings(action="ignore"):
-        table = read_table(path)
+    table = read_table(path)
     missing = [name for name in MAP_COLUMNS if name not in table.colnames]
     if missing or not len(table):
         fault = f"no column {missing[0]}" if missing else "no LED"

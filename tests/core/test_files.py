@@ -6,6 +6,7 @@ import datetime
 import errno
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -538,3 +539,64 @@ def test_a_yaml_file_is_read_again_after_a_change_of_file_or_values(
     assert yaml_reader.read_yaml(file)[0] == {"a": {"b": [1, 2]}}
     file.write_text("a: {b: [1, 4]}")
     assert yaml_reader.read_yaml(file)[0] == {"a": {"b": [1, 4]}}
+
+
+ECSV = """# %ECSV 1.0
+# ---
+# datatype:
+# - {{name: x, datatype: {}}}
+x
+1
+{}
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "cell", "says"),
+    [
+        ("float6", "2", "not an ECSV table: unexpected datatype 'float6'"),
+        ("int64", "2.5.1", "line 7: no row of the table"),
+        ("float32", "2", ""),
+    ],
+)
+def test_a_table_is_refused_without_a_warning(
+    tmp_path: Path, kind: str, cell: str, says: str
+) -> None:
+    """Astropy warns of an unknown type, and uses it."""
+    path = tmp_path / "x.ecsv"
+    path.write_text(ECSV.format(kind, cell))
+    with warnings.catch_warnings(action="error"):
+        if says:
+            with pytest.raises(InputError, match=rf"^[^\n]*{re.escape(says)}[^\n]*$"):
+                files.read_table(path)
+        else:
+            assert files.read_table(path)["x"].tolist() == [1, 2]
+
+
+def test_a_header_without_end_is_refused_before_it_is_parsed(tmp_path: Path) -> None:
+    path = tmp_path / "x.ecsv"
+    path.write_text("# %ECSV 1.0\n" + "#   - 1\n" * files.MAX_HEADER_LINES + "x\n1\n")
+    with pytest.raises(InputError, match="a header of 5001 lines; allowed: up to 5000"):
+        files.read_table(path)
+
+
+@pytest.mark.parametrize("bad", [7, 100, 4006])
+def test_the_first_wrong_row_of_a_table_is_named(
+    tmp_path: Path, bad: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of two wrong ones; halves of the rows are read, together as many again."""
+    path = tmp_path / "x.ecsv"
+    lines = ECSV.format("int64", "3").splitlines() + ["4"] * 4000
+    lines[bad - 1] = "a"
+    lines[-1] = "b"
+    path.write_text("\n".join(lines))
+    read = []
+    original = Table.read
+    monkeypatch.setattr(
+        Table,
+        "read",
+        lambda rows, **kind: (read.append(len(rows)), original(rows, **kind))[1],
+    )
+    with pytest.raises(InputError, match=f"line {bad}: no row of the table"):
+        files.read_table(path)
+    assert sum(read) < 2.1 * len(lines) + 20 * 5
