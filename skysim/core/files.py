@@ -195,13 +195,23 @@ def write_table(path: Path, table: Any) -> None:
         table.write(temporary, format="ascii.ecsv", overwrite=True)
 
 
+@contextmanager
+def strict_warnings() -> Iterator[None]:
+    """Raise the warnings of astropy about a damaged file, and those of NumPy about numbers beyond their type."""
+    from astropy.utils.exceptions import AstropyWarning
+
+    with warnings.catch_warnings():
+        for category in (AstropyWarning, RuntimeWarning):
+            warnings.simplefilter("error", category)
+        yield
+
+
 MAX_HEADER_LINES = 5000  # of an ECSV table; a map's has some hundred
 
 
 def read_table(path: Path) -> Any:
     """The astropy table in an ECSV file. Raises InputError if the file is not valid ECSV, with the first bad line."""
     from astropy.table import Table
-    from astropy.utils.exceptions import AstropyWarning
 
     lines = read_lines(path)
     # Before it is parsed, which takes a second for a thousand lines.
@@ -211,11 +221,7 @@ def read_table(path: Path) -> Any:
 
     def parse(some: list[Line]) -> Any:
         try:
-            # They warn of unknown types in the header, and of numbers beyond their type.
-            with (
-                warnings.catch_warnings(action="error", category=AstropyWarning),
-                warnings.catch_warnings(action="error", category=RuntimeWarning),
-            ):
+            with strict_warnings():
                 return Table.read([line for _, line in some], format="ascii.ecsv")
         except Exception as error:  # astropy's parsers raise many types
             return error

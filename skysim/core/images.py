@@ -14,7 +14,6 @@ import math
 import os
 import re
 import tempfile
-import warnings
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, contextmanager, suppress
@@ -31,6 +30,7 @@ from skysim.core import encoded
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_pixels, silent_stderr
 from skysim.core.errors import InputError, reason
+from skysim.core.files import strict_warnings
 from skysim.core.guarded import run_guarded
 from skysim.core.text import LARGEST
 from skysim.core.types import Record, frozen
@@ -106,9 +106,8 @@ def read_fits_images(path: Path) -> list["ViewedImage"]:
         raise
     except (OSError, UserWarning) as error:
         raise InputError(path, f"not a complete FITS file: {reason(error)}") from None
-    except (
-        Exception
-    ):  # a damaged header makes astropy raise many types, with words for its authors
+    except Exception:
+        # A damaged header makes astropy raise many types, with words for its authors.
         raise InputError(path, "not a complete FITS file") from None
     raise InputError(path, "a FITS file without an image")
 
@@ -119,8 +118,6 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
 
     A .gz file is unpacked to a temporary file first.
     """
-    from astropy.utils.exceptions import AstropyWarning
-
     packed = path.suffix.lower() == ".gz"
     with ExitStack() as stack:
         plain = path
@@ -129,10 +126,8 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
             unpack(path, temporary)
             plain = Path(temporary.name)
         file = stack.enter_context(plain.open("rb"))
-        stack.enter_context(warnings.catch_warnings())
-        # "File may have been truncated" is one; NumPy's are of numbers beyond those of an image.
-        for category in (AstropyWarning, RuntimeWarning):
-            warnings.simplefilter("error", category)
+        # "File may have been truncated" is one.
+        stack.enter_context(strict_warnings())
         if file.read(len(MAGIC)) != MAGIC:
             allowed = "one that begins with SIMPLE" + ("" if packed else ", not compressed")
             raise InputError(path, "not a complete FITS file", allowed)

@@ -31,6 +31,7 @@ from skysim.core.types import (
     Record,
     SourceTruth,
     Truth,
+    lengths,
     taken,
 )
 from skysim.experiments.study.execution import trials
@@ -218,7 +219,7 @@ def image_extents(rows: NDArray, window: Window, height_px: int) -> Extents:
     streak = np.nan_to_num(
         np.column_stack([rows["streak_x_px"], rows["streak_y_px"]]).astype(float)
     )
-    length = np.linalg.norm(streak, axis=1)
+    length = lengths(streak)
     along = np.where(
         length[:, None] > STILL_PX, streak / np.maximum(length, STILL_PX)[:, None], [1.0, 0.0]
     )

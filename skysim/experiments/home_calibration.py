@@ -42,7 +42,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import UP, Floats, Ints, Record, normalized
+from skysim.core.types import UP, Floats, Ints, Record, lengths, normalized
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
 from skysim.experiments.dome_survey.survey_procedure import (
     ATTITUDES,
@@ -308,7 +308,7 @@ def scaled(known: CalibrationPrior, first: Sighting, clicks: int) -> Camera:
     from skimage.transform import estimate_transform
 
     place_m = known.leds.position_m[np.searchsorted(known.leds.id, first.led)][:, :2]
-    from_center = np.linalg.norm(place_m - place_m.mean(axis=0), axis=1)
+    from_center = lengths(place_m - place_m.mean(axis=0))
     clicked = np.argsort(from_center)[: clicks + 1]
     if len(clicked) < QUEST_LEDS:
         raise InputError("clicks", f"{len(clicked)} LEDs in the first frame", "2 or more")

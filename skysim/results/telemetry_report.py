@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import ARCSEC_DEG, ARCSEC_RAD, RPM_RAD_S
-from skysim.core.types import Floats, Record, Telemetry
+from skysim.core.types import Floats, Record, Telemetry, lengths
 from skysim.dynamics.imu import Increments, tilt_rad
 from skysim.results.plots import figure_png, stacked_axes
 from skysim.simulation.motion import at_limit, saturation_text
@@ -52,7 +52,7 @@ def summary(log: Telemetry) -> dict[str, float]:
             statistics["saturated_s"] = saturated_s(log)
         # A prescribed motion, without a reference, leaves wheels and gimbals as they were.
         if log.wheel_rad_s.size or log.gimbal_rad.size:
-            statistics["momentum_nms_worst"] = np.linalg.norm(log.momentum_nms, axis=1).max()
+            statistics["momentum_nms_worst"] = lengths(log.momentum_nms).max()
         if log.wheel_rad_s.size:
             statistics["wheel_rpm_worst"] = np.abs(log.wheel_rad_s).max() / RPM_RAD_S
         if log.manipulability is not None:
@@ -190,7 +190,7 @@ def attitude_error_panel(log: Telemetry, axes: Any) -> None:
         if error_deg is not None:
             axes.semilogy(log.t_s, np.maximum(error_deg, 1e-7), color=color, label=name)
     if log.sigma_attitude_rad is not None:
-        sigma_deg = np.degrees(np.linalg.norm(log.sigma_attitude_rad, axis=1))
+        sigma_deg = np.degrees(lengths(log.sigma_attitude_rad))
         axes.semilogy(log.t_s, 3 * sigma_deg, ":", color="tab:green", label="filter 3σ")
     if log.saturated is not None and log.saturated.any():
         low, high = axes.get_ylim()
@@ -275,7 +275,7 @@ def gimbals_panel(log: Telemetry, axes: Any) -> None:
 
 def momentum_panel(log: Telemetry, axes: Any) -> None:
     axes.plot(log.t_s, log.momentum_nms, label=AXES)
-    norm_nms = np.linalg.norm(log.momentum_nms, axis=1)
+    norm_nms = lengths(log.momentum_nms)
     axes.plot(log.t_s, norm_nms, color="k", lw=1, label="norm")
     axes.set_ylabel("stored momentum\n[N m s]")
 

@@ -24,7 +24,7 @@ from skysim.camera import as_built
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import AIR_CURRENT, IMU, random_stream
-from skysim.core.types import Bools, Floats, Mounting, Record, Telemetry, Trajectory
+from skysim.core.types import Bools, Floats, Mounting, Record, Telemetry, Trajectory, lengths
 from skysim.core.units import significant
 from skysim.dynamics import guidance, imu, multibody
 from skysim.dynamics.disturbances import DisturbanceModel
@@ -223,7 +223,7 @@ def shortfall(lab: Lab, forecast: TorqueForecast | None) -> str:
         return ""
     period_s, t_s, needed, given, _ = forecast
     owed = needed - given
-    missing = np.linalg.norm(owed, axis=1)
+    missing = lengths(owed)
     if (missing > MISSING * np.abs(needed).max()).sum() * period_s < LEAST_SHORT_S:
         return ""
     # Later the actuators give more than is needed: what they owe.

@@ -54,10 +54,10 @@ class Gain(NamedTuple):
 
 def fused(lab: Lab, solutions: list[Attitude]) -> tuple[Rotation, np.ndarray]:
     """body_from_ref and its covariance (3, 3) in body axes from one solution of each camera."""
-    start = lab.camera.mount.cam_from_body.inv() * solutions[0].cam_from_ref
+    start = lab.camera.mount.body_from_cam * solutions[0].cam_from_ref
     mekf = AttitudeFilter(NO_GYRO, 0.0, start, 0.1, 0.0, considered=(), heads=len(solutions))
     for head, (camera, solution) in enumerate(zip(lab.cameras, solutions, strict=True)):
-        body_from_cam = camera.mount.cam_from_body.inv()
+        body_from_cam = camera.mount.body_from_cam
         R = body_from_cam.as_matrix()
         mekf.update(
             0.0,

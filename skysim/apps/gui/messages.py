@@ -226,9 +226,8 @@ Curves = dict[
 ]  # curves of a simulated motion and their times `t_s`, decimated for display
 
 
-AtLimit = tuple[
-    str, float, float
-]  # what was at its limit in a flight, from a time to another
+# What was at its limit in a flight, from a time to another.
+AtLimit = tuple[str, float, float]
 
 
 class FlightRow(NamedTuple):

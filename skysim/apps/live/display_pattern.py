@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import centers_of
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, frozen
+from skysim.core.types import Bools, Floats, frozen, lengths
 from skysim.scene.sections.layouts import (
     LcdConfig,
     LensDisplayConfig,
@@ -188,7 +188,7 @@ def lights_of(lits: Iterable[Lit], exposure: Exposure) -> tuple[Floats, Floats]:
         for sources in filter(None, (lit.points, centers_of(lit.discs))):
             seen = sources.take(~hidden(sources.place)) if hidden else sources
             offset_m = seen.xyz - seen.place[:, 3:] * exposure.camera_m
-            distance_m = np.linalg.norm(offset_m, axis=1)
+            distance_m = lengths(offset_m)
             direction = offset_m / distance_m[:, None]
             cos_out = -np.sum(direction * seen.normal, axis=1)
             near = irradiance_e_s_m2(

@@ -10,7 +10,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, printable
-from skysim.core.types import Record, joined, taken
+from skysim.core.types import Record, joined, lengths, taken
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
@@ -196,7 +196,7 @@ def draw_size(config: CameraConfig, night: Night, fig: Any) -> None:
     axes = fig.subplots()
     size = night.size
     center_px = night.lens.camera.center_px if night.lens else config.center_px
-    rho = np.linalg.norm(size.used.xy_px - np.array(center_px), axis=1) / config.corner_px
+    rho = lengths(size.used.xy_px - np.array(center_px)) / config.corner_px
     sigma_px = np.sqrt(size.used.variance_px2)
     axes.errorbar(
         rho,

@@ -14,7 +14,7 @@ from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
-from skysim.core.types import UP, Bools, Floats, Record, frozen
+from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
     GATE_SIGMAS,
@@ -289,7 +289,7 @@ def find_faults(run: SurveyRun) -> Record:
         leds.position_m, survey.leds.position_m, survey.led_covariance_m2
     )
     size_m = survey_faults.found_displacements_m(survey.led_covariance_m2, sigma_m)
-    off_m = np.linalg.norm(survey.leds.position_m - leds.position_m, axis=1)
+    off_m = lengths(survey.leds.position_m - leds.position_m)
     # The time of a code that runs freely is unknown, so the expected light of each LED is unknown.
     code = run.prior.code
     is_free = code is not None and code.bit_time_s is not None

@@ -20,7 +20,17 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Frame, Ints, Sources, Truth, around_z, frozen
+from skysim.core.types import (
+    Bools,
+    Floats,
+    Frame,
+    Ints,
+    Sources,
+    Truth,
+    around_z,
+    frozen,
+    lengths,
+)
 from skysim.core.units import quantities_within
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import DomeConfig
@@ -113,7 +123,7 @@ class CalibrationPrior(NamedTuple):
     @property
     def nearest_m(self) -> float:
         """Least distance of an LED from the center of rotation."""
-        return float(np.linalg.norm(self.leds.position_m, axis=1).min())
+        return float(lengths(self.leds.position_m).min())
 
     @property
     def px_per_m(self) -> float:
@@ -512,10 +522,10 @@ def common_shift_px(
     detection i from the nearest shifted prediction, s_i its individual_px and s the greatest of all. The best candidate
     is refined by the mean residual of the detections in the gate, weighted by 1 / s_i^2.
     """
-    inner = np.argsort(np.linalg.norm(detected_px - center_px, axis=1))[:ANCHOR_LIGHTS]
+    inner = np.argsort(lengths(detected_px - center_px))[:ANCHOR_LIGHTS]
     candidates = (detected_px[inner, None] - predicted_px).reshape(-1, 2)
     limit_px = GATE_SIGMAS * np.hypot(common_px, individual_px.max())
-    candidates = candidates[np.linalg.norm(candidates, axis=1) < limit_px]
+    candidates = candidates[lengths(candidates) < limit_px]
     candidates = np.vstack([np.zeros((1, 2)), candidates])  # no shift is also a candidate
     distance_px, nearest = cKDTree(predicted_px).query(detected_px - candidates[:, None])
     sigma_px = individual_px[nearest]

@@ -14,7 +14,7 @@ from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth
+from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth, lengths
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -234,7 +234,7 @@ def draw_means(
     enough = count >= 5
     centers = centers[enough]
     means = means[enough]
-    largest_px = float(np.linalg.norm(means, axis=1).max(initial=0)) or 1.0
+    largest_px = float(lengths(means).max(initial=0)) or 1.0
     arrows = axes.quiver(
         *centers.T, *means.T, angles="xy", scale_units="xy", scale=2 * largest_px / width_px
     )
@@ -422,7 +422,7 @@ def draw_coverage(axes: Any, so_far: Coverage, faults: Record, further: Rotation
 def draw_errors(axes: Any, title: str, place_m: Floats, error_m: Floats) -> None:
     """Arrows of LED errors; the scale is in the key, and color is the vertical error."""
     rms_mm = 1e3 * math.sqrt(np.mean(error_m**2))
-    scale_mm = 1e3 * float(np.quantile(np.linalg.norm(error_m, axis=1), 0.95)) or 1.0
+    scale_mm = 1e3 * float(np.quantile(lengths(error_m), 0.95)) or 1.0
     x_m, y_m, _ = place_m.T
     arrows = axes.quiver(
         x_m, y_m, *(1e3 * error_m.T), angles="xy", scale=25 * scale_mm, cmap="coolwarm"

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from skysim.core import files
 from skysim.core.constants import INCH_M
 from skysim.core.errors import check_name
-from skysim.core.types import UP, Floats, azimuths_rad, normalized
+from skysim.core.types import UP, Floats, azimuths_rad, lengths, normalized
 from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
@@ -161,7 +161,7 @@ def at(surface: Surface, rays: Floats) -> Floats:
 
 def length_m(points_m: Floats) -> Floats:
     """(...) lengths of polylines (..., K, 3)."""
-    return np.linalg.norm(np.diff(points_m, axis=-2), axis=-1).sum(axis=-1)
+    return lengths(np.diff(points_m, axis=-2)).sum(axis=-1)
 
 
 def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:

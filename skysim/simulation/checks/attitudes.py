@@ -11,7 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.types import UP, Floats
+from skysim.core.types import UP, Floats, lengths
 from skysim.dynamics import multibody
 from skysim.simulation.lab import Lab
 
@@ -45,7 +45,7 @@ class CheckedAttitudes(NamedTuple):
     @property
     def speed_deg_s(self) -> Floats:
         """(N,) lengths of the rates."""
-        return np.degrees(np.linalg.norm(self.rate_body_rad_s, axis=1))
+        return np.degrees(lengths(self.rate_body_rad_s))
 
     @property
     def tilts_deg(self) -> Floats:

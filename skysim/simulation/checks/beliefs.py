@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from skysim.core.types import Floats, Ints, Sources, frozen, normalized
+from skysim.core.types import Floats, Ints, Sources, frozen, lengths, normalized
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks.views import CameraModel
@@ -148,7 +148,7 @@ def map_faults(mapped: DomeMap, lab: Lab, place_m: Floats) -> tuple[str, ...]:
     """
     true = calibration(lab.scene.camera)
     limit = FAULT_SIGMAS * math.sqrt(3)  # from one axis to the length of a vector
-    led_m = np.linalg.norm(mapped.position_m - place_m, axis=1)
+    led_m = lengths(mapped.position_m - place_m)
     moved = led_m > limit * mapped.sigma_m
     lever_m = math.dist(mapped.camera_body_m, lab.camera.mount.camera_body_m)
     zoom = mapped.focal_px / true.focal_px - 1
@@ -217,7 +217,7 @@ def neighbor_shift(place: Floats, rate_e_s: Floats, row: Ints, camera: CameraMod
     first = row[pairs["i"]]
     second = pairs["j"]
     apart = place[second] - place[first]
-    apart_px = focal_px * np.linalg.norm(apart, axis=1)
+    apart_px = focal_px * lengths(apart)
     electrons = rate_e_s * camera.exposure_s
     # 2. The displacements by all neighbors of a star add up.
     moved_px = response_px(apart_px, electrons[first], electrons[second], camera)
@@ -270,7 +270,7 @@ def describe(beliefs: Beliefs, scene: Scene) -> list[str]:
     """The beliefs in words: one line for each that is uncertain or wrong, or one that says that all are exact."""
     lines = []
     if not math.isnan(beliefs.epoch_jyear):
-        error_arcsec = np.degrees(np.linalg.norm(beliefs.direction_error, axis=1)) * 3600
+        error_arcsec = np.degrees(lengths(beliefs.direction_error)) * 3600
         differ = (
             f"; its stars are {np.median(error_arcsec):.2g}″ (median) from the sky's"
             if len(error_arcsec)

@@ -56,7 +56,7 @@ from estimator.trackers.dome_tracker import FITS_FOCAL, FOCAL_UNCERTAINTY
 from skysim.camera.optics import Optics
 from skysim.camera.projection import lateral_color
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, normalized
+from skysim.core.types import Floats, lengths, normalized
 from skysim.scene.unused import differs
 from skysim.simulation.checks.detection import Context, centroid_variance, misshapen_px
 from skysim.simulation.checks.views import View
@@ -407,7 +407,7 @@ def within_gate(view: View, context: Context) -> View:
     error = context.beliefs.direction_error[view.row]
     if not error.any():
         return view
-    off_px = np.linalg.norm(error - np.median(error, axis=0), axis=1)
+    off_px = lengths(error - np.median(error, axis=0))
     off_px *= context.camera.optics.camera.focal_px
     return view.take(off_px <= GATE_SIGMA * believed_sigma_px(view, context))
 

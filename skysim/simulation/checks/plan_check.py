@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.camera import wcs
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Record, polar_rad
+from skysim.core.types import Floats, Record, lengths, polar_rad
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -255,7 +255,7 @@ def dome_warnings(lab: Lab) -> list[str]:
     # width D f / d. Defocus of a thin lens with the pupil A adds A |1 / d - 1 / focus| f.
     if scene.tracker.detector == "local":
         camera = scene.camera
-        distance_m = np.linalg.norm(sources.xyz, axis=1)
+        distance_m = lengths(sources.xyz)
         typical_m = float(
             np.median(distance_m - np.linalg.norm(lab.camera.mount.camera_body_m))
         )

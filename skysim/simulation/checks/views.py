@@ -23,7 +23,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.core.types import Bools, Floats, Ints, Mount, Sources
+from skysim.core.types import Bools, Floats, Ints, Mount, Sources, lengths
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
@@ -102,7 +102,7 @@ class View(NamedTuple):
     @property
     def streak_length_px(self) -> Floats:
         """(n,) length of the path during the exposure."""
-        return np.linalg.norm(self.streak_px, axis=1)
+        return lengths(self.streak_px)
 
     @property
     def blur2_px2(self) -> Floats:
@@ -225,7 +225,7 @@ def view(
     depth_m = np.where(chosen.place[:, 3] > 0, offset_m[:, 2], np.inf)
     disk_px = optics.camera.focal_px * chosen.radius_m / distance_m  # a star has no radius
     lens2_px2, defocus_px = lens_blur(camera, chosen, xy_px, depth_m)
-    share = peak_share(lens2_px2, disk_px, defocus_px, np.linalg.norm(streak_px, axis=1))
+    share = peak_share(lens2_px2, disk_px, defocus_px, lengths(streak_px))
     sigma_px = np.sqrt(lens2_px2 + (disk_px**2 + defocus_px**2) / 4)
     return View(
         exposure.time,
@@ -282,7 +282,7 @@ def lens_blur(
 
 def image_gradient(optics: Optics, offset_m: Floats) -> Floats:
     """(n, 2, 3) derivatives of the image positions by the offsets in camera axes, from central differences."""
-    step_m = STEP * np.linalg.norm(offset_m, axis=1)[:, None, None] * np.eye(3)
+    step_m = STEP * lengths(offset_m)[:, None, None] * np.eye(3)
     ahead, behind = (optics.project(offset_m[:, None, :] + sign * step_m) for sign in (1, -1))
     return np.swapaxes(ahead - behind, 1, 2) / (2 * step_m.max(axis=2)[:, None, :])
 

@@ -123,7 +123,7 @@ def test_every_state_of_a_light_is_seen_in_the_laboratory() -> None:
 
 
 def test_marks_and_states_differ_by_shape_or_text_as_well_as_by_color() -> None:
-    """So that they are told apart with any eyes, and in gray."""
+    """Color-blind users can distinguish them, also in a gray print."""
     shapes = (
         (SCRIPTS / "marks.js")
         .read_text()

@@ -9,7 +9,7 @@ import numpy as np
 from nicegui import ui
 
 from skysim.apps.gui.messages import Residual
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Floats, Ints, lengths
 
 
 class FlightLights(ui.element, component="js/residuals.js"):  # type: ignore[call-arg]
@@ -37,5 +37,5 @@ def by_light(residuals: Sequence[Residual]) -> tuple[Ints, Ints, Floats, Floats]
     squares_px2 = np.bincount(rows, np.sum((vectors_px - mean_px[rows]) ** 2, axis=1))
     with np.errstate(invalid="ignore"):
         scatter_px = np.sqrt(squares_px2[: len(ids)] / (frames - 1))
-    worst = np.argsort(-np.linalg.norm(mean_px, axis=1), kind="stable")
+    worst = np.argsort(-lengths(mean_px), kind="stable")
     return ids[worst], frames[worst], mean_px[worst], scatter_px[worst]

@@ -20,6 +20,7 @@ from skysim.core.types import (
     Trajectory,
     Truth,
     grid_points,
+    lengths,
 )
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody.mjcf_export import FOVY_DEG, brightest
@@ -126,11 +127,11 @@ def scene_pose(lab: Lab, lens: Lens, truth: Truth) -> Pose:
         return Pose(rotation)
     place_m = truth.lab_from_body.apply(lab.camera.mount.camera_body_m)
     rays_cam = np.column_stack([lens.x, lens.y, np.ones(len(lens.x))])
-    length = np.linalg.norm(rays_cam, axis=1)
+    length = lengths(rays_cam)
     dome = surface.build_surface(light.surface)
     points_m = dome.meet(place_m, lab_from_cam.apply(rays_cam / length[:, None]))
     # Depths along the boresight, to 0.01 mm; NaN where a ray meets nothing.
-    depth_m = np.linalg.norm(points_m - place_m, axis=1) / length
+    depth_m = lengths(points_m - place_m) / length
     return Pose(rotation, place_m, depth_m.round(5))
 
 

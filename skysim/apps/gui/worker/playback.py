@@ -35,7 +35,7 @@ from skysim.apps.gui.worker import pixels, workbench
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, Frame, Mount, Telemetry
+from skysim.core.types import Bools, Floats, Frame, Mount, Telemetry, lengths
 from skysim.dynamics import guidance, multibody
 from skysim.experiments.dome_survey import (
     adjust,
@@ -220,7 +220,7 @@ def at_limits(log: Telemetry, vehicle: VehicleConfig) -> Iterator[AtLimit]:
 def light_residuals(view: FrameView, mount: Mount) -> Iterator[Residual]:
     """The residual of every light that is identified in a frame."""
     assert view.result is not None
-    lab_from_cam = quaternion.to_rotation(view.body_wxyz) * mount.cam_from_body.inv()
+    lab_from_cam = quaternion.to_rotation(view.body_wxyz) * mount.body_from_cam
     across_lab = lab_from_cam.as_matrix()[:, :2]  # directions of x and y
     for spot in view.result.detections:
         px = math.hypot(*spot.residual_px)
@@ -243,8 +243,8 @@ def curves(log: Telemetry) -> Curves:
         is not None
     }
     values["t_s"] = log.t_s
-    values["momentum"] = np.linalg.norm(log.momentum_nms, axis=1)
-    values["rate"] = np.degrees(np.linalg.norm(log.rate_body_rad_s, axis=1))
+    values["momentum"] = lengths(log.momentum_nms)
+    values["rate"] = np.degrees(lengths(log.rate_body_rad_s))
     every = max(len(log.t_s) // MAX_POINTS, 1)
     return {name: curve[::every] for name, curve in values.items()}
 

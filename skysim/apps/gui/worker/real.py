@@ -108,7 +108,7 @@ class RealComparison:
         attitude = report.attitude
         mount = bench.lab.camera.mount
         if attitude.cam_from_ref is not None:
-            body_from_lab = mount.cam_from_body.inv() * attitude.cam_from_ref
+            body_from_lab = mount.body_from_cam * attitude.cam_from_ref
             self.taken.append(SurveyFrame(report.centroids, body_from_lab, len(self.taken)))
             self.rms_px.append(attitude.rms_px)
             if follow:
