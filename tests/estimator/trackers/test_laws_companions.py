@@ -12,6 +12,7 @@ from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.identification.star_detections import information_of
+from estimator.identification.star_evidence import Solution
 from estimator.trackers import misfit
 from estimator.trackers.misfit import ARCSEC_RAD, ERROR_RAD, SHARE
 from estimator.trackers.pipeline import Settings
@@ -78,6 +79,35 @@ def test_coarse_centroids_ignore_companions(tracker: StarTracker, seed: int) -> 
     assert not misfit.are_small(detections.sigma / 3)
     assert after is solution
     assert errors is detections
+
+
+@law(misfit.with_companions)
+@given(seed=some.integers(0, 10**6))
+def test_three_others_tell_that_a_star_is_double_and_two_do_not(
+    tracker: StarTracker, seed: int
+) -> None:
+    """Four stars of 0.2" each, one of them 10" off: it loses its information. Of three, each keeps its own."""
+    rng = np.random.default_rng(seed)
+    truth = Rotation.random(rng=rng)
+    xy_px = np.nan_to_num(CAMERA.pixels(truth.apply(tracker.stars.vectors)), nan=-1e9)
+    star = rng.permutation(np.flatnonzero(CAMERA.contains(xy_px)))[:4]
+    seen_px = xy_px[star]
+    seen_px[0, 0] += 0.5
+    sigma_px = np.full(4, 0.01)
+    for count in (4, 3):
+        centroids = Centroids(seen_px[:count], sigma_px[:count], np.ones(count))
+        detections = tracker.detections(centroids, sigma_px[:count])
+        solution = Solution(
+            np.arange(count), star[:count], truth.as_quat(), np.eye(3), 1.0, 0.0, 0.0, 0.0
+        )
+        after, errors = misfit.with_companions(solution, detections, tracker.sky)
+        if count == 3:
+            assert after is solution
+            assert errors is detections
+        else:
+            share = errors.weight[:, :2] / detections.weight[:, :2]
+            assert np.all(share[0] < 0.1)
+            assert np.all(share[1:] > 0.5)
 
 
 @law(information_of)

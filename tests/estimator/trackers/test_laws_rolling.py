@@ -290,6 +290,10 @@ def test_the_gyro_gives_the_sign_of_a_global_shutter_frame_s_rate(
     assert_allclose(signed.rate_rad_s, seen.rate_rad_s, rtol=0, atol=1e-4)
     assert_allclose(np.abs(open_sign.rate_rad_s), np.abs(seen.rate_rad_s), rtol=0, atol=1e-4)
     assert still.solve_centroids(found).rate is None
+    solved = still.solve_centroids(found)
+    for lacking in (replace(solved, match=None), replace(solved, camera=None)):
+        assert rolling_shutter.with_streak_rate(lacking, found, EXPOSURE_S) is lacking
+    assert rolling_shutter.with_streak_rate(solved, found, EXPOSURE_S).rate is not None
     with pytest.raises(ImageError, match=r"exposure_s: 0.0; allowed: finite, above 0"):
         still.solve_centroids(found, exposure_s=0.0)
 
