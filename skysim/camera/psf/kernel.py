@@ -43,6 +43,7 @@ QUANTUM_PX = 0.01  # sizes are rounded to this, so that LEDs of nearly one size 
 CUT_SIGMA = 5.0  # a Gaussian's image ends here: 4e-6 of its light is beyond
 FADE_PX = 2.0  # width over which infinite wings are faded to zero
 OTF_FLOOR = 1e-6  # a transfer function below this is taken as zero
+OPAQUE = 1e-12  # below this, a product is too small for a further factor to matter in single precision
 HARMONICS = (0, 4, 8)  # a square has only multiples of four
 HARMONIC_FLOOR = 5e-5  # a harmonic below this fraction of the peak is left out
 # Largest T8, over the peak and over the total light, for which T0 to T8 are enough.
@@ -168,7 +169,14 @@ class PsfModel:
             product = product * blur(sigma_px, fx, fy)
         for radius in self.radii_px:
             product = product * uniform_disk(radius, fx, fy)
-        return product * coma(self.coma_px, fx, fy) if any(self.coma_px) else product
+        if not any(self.coma_px):
+            return product
+        # Most frequencies of a table pass nothing, and the integral over the pupil takes long.
+        passed = np.abs(product) > OPAQUE
+        axes = (axis[passed] for axis in np.broadcast_arrays(fx, fy))
+        with_coma = np.zeros(product.shape, complex)
+        with_coma[passed] = product[passed] * coma(self.coma_px, *axes)
+        return with_coma
 
     def reach_px(self) -> float:
         """Radius of a circle that holds the image, pixels' corners included."""
