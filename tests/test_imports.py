@@ -60,6 +60,7 @@ def test_an_import_cycle_is_found() -> None:
     assert circles({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": set()}) == ["a", "b", "c"]
 
 
+@pytest.mark.slow
 def test_no_module_imports_itself_through_others() -> None:
     assert len(graph()) > 250
     assert circles(graph()) == []
@@ -80,6 +81,7 @@ def test_no_folder_holds_too_many_modules(package: str) -> None:
         assert len(entries) <= 18, sorted(entries)
 
 
+@pytest.mark.slow
 def test_no_file_imports_a_module_of_ours_under_two_names() -> None:
     """Two names for one module read like two modules."""
     for name, path in FILES.items():

@@ -119,7 +119,12 @@ def hint(image: NDArray, fov_deg: float | None, catalog_name: str | None = None)
 @pytest.mark.parametrize(
     ("change", "fov_deg", "says"),
     [
-        (mirror, FOV_DEG, r"^perhaps mirrored: it solves when flipped left to right; "),
+        pytest.param(
+            mirror,
+            FOV_DEG,
+            r"^perhaps mirrored: it solves when flipped left to right; ",
+            marks=pytest.mark.slow,
+        ),
         pytest.param(np.flipud, FOV_DEG, r"^perhaps mirrored: ", marks=pytest.mark.slow),
         pytest.param(
             *(np.array, 30.0, r"another field of view: it solves with a field of 14\.8°$"),

@@ -108,6 +108,7 @@ WRITERS: dict[str, tuple[Callable[[Path, NDArray], Path], float, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", WRITERS)
 def test_every_format_gives_the_attitude_within_its_sigma(
     name: str, frame: tuple[NDArray, Rotation], tmp_path: Path
@@ -149,6 +150,7 @@ def test_a_refusal_also_says_what_was_changed(tmp_path: Path) -> None:
     assert "the gain is estimated" in found.hint
 
 
+@pytest.mark.slow
 def test_pages_are_solved_one_by_one(
     frame: tuple[NDArray, Rotation], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -114,6 +114,7 @@ def check_right(found: dict[str, Any], truth: Truth, fov_deg: float = FOV_DEG) -
 # Orientation
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("orientation", STORED)
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])
 def test_the_answer_refers_to_the_image_as_viewed(

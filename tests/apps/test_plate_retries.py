@@ -125,6 +125,7 @@ def test_round_stars_are_not_taken_for_trails() -> None:
     assert not list(diagnosis.trails(image, Settings()))
 
 
+@pytest.mark.slow
 def test_an_upper_half_is_solved_in_its_own_field() -> None:
     """The trackers' field is the upper half; attitude and camera refer to the whole image."""
     image, truth = drawn(replace(SHOT, fov_deg=36.0, limit_mag=5.6), 7)

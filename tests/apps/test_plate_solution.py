@@ -117,6 +117,7 @@ def test_a_solution_has_the_attitude_its_covariance_and_the_stars(tmp_path: Path
     assert (gamma["ra_deg"], gamma["dec_deg"]) == pytest.approx((81.2828, 6.3497), abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_list_of_lights_gives_the_attitude_of_its_picture(
     tmp_path: Path,
 ) -> None:
@@ -144,6 +145,7 @@ def test_a_list_of_lights_gives_the_attitude_of_its_picture(
         skysim.solve(lights, camera="shefex2")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("near_deg", "solved"), [((83, 2, 5), True), ((200, -40, 20), False)]
 )
@@ -182,6 +184,7 @@ def test_a_sequence_has_rates_and_gaps() -> None:
         plate_solver.add_rates(results, None)
 
 
+@pytest.mark.slow
 def test_the_command_writes_header_table_and_the_rates_of_a_video(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

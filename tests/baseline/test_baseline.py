@@ -19,6 +19,7 @@ def compared(*names: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
 
 
+@pytest.mark.slow
 def test_messages_of_wrong_scenes_match_the_baseline() -> None:
     done = compared("messages/skysim.load_scene*")
     assert done.returncode == 0, done.stdout

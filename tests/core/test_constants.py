@@ -100,6 +100,7 @@ def test_the_suns_magnitude_follows_from_its_luminosity() -> None:
     assert pytest.approx(-26.76, abs=0.025) == constants.SUN_V_MAG
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("package", OWN_FILES)
 def test_no_constant_is_defined_twice(package: str) -> None:
     own = [ROOT / package / name for name in OWN_FILES[package]]

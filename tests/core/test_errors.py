@@ -180,6 +180,7 @@ def mentions(tree: ast.AST, name: str) -> bool:
     return any(isinstance(node, ast.Name) and node.id == name for node in ast.walk(tree))
 
 
+@pytest.mark.slow
 def test_an_error_requires_a_key_and_a_problem() -> None:
     found = [
         f"{path}:{call.lineno}"
@@ -195,6 +196,7 @@ def test_only_errors_of_the_command_line_mention_it() -> None:
         f"{path}:{node.lineno}"
         for path, tree, text in modules("skysim")
         if path.parts[1:3] not in (("apps", "cli"), ("apps", "live"))
+        and COMMAND_LINE.search(text)  # else no node is searched, which takes seconds
         for node in [
             *made_errors(tree),
             *(one for one in ast.walk(tree) if isinstance(one, ast.Raise)),
@@ -237,6 +239,7 @@ def reads_text(node: ast.AST, error: str) -> bool:
     )
 
 
+@pytest.mark.slow
 def test_no_handler_reads_the_text_of_an_error() -> None:
     found = [
         f"{path}:{node.lineno}"

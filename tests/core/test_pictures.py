@@ -419,6 +419,7 @@ class imread:
 """
 
 
+@pytest.mark.slow
 def test_camera_raw_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a stand-in for rawpy, which decodes in a child process."""
     path = tmp_path / "x.nef"

@@ -163,6 +163,7 @@ def test_masses_move_at_their_speed_to_their_travel() -> None:
     np.testing.assert_allclose(positions, expected, rtol=0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_displaced_mass_tilts_the_table_by_its_weight_times_its_lever() -> None:
     """At rest the first moment M c + m d points down: it was moved by (0.2 kg 4 mm, -0.2 kg 3 mm, 0)."""
     table = vehicle(trims={}, drag={"viscous": "0.1 N m s"})

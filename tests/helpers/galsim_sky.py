@@ -157,7 +157,7 @@ def render_frames(
         )
         counts = np.clip(np.rint(image.array + OFFSET_DN), 0, SATURATED_DN).astype(np.uint16)
         file = galsim.ImageUS(counts, xmin=1, ymin=1, wcs=plate)
-        file.header = galsim.FitsHeader({"DATE-OBS": setup.utc})
+        file.header = galsim.FitsHeader({"DATE-OBS": setup.utc, "ROWORDER": "TOP-DOWN"})
         path = folder / "frame.fits"
         file.write(str(path))
         yield RenderedFrame(

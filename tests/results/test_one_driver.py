@@ -66,6 +66,7 @@ def test_each_frame_of_each_camera_is_exposed_once_with_a_filter_or_without(
     assert exposed.call_count == 2 * cameras
 
 
+@pytest.mark.slow
 def test_a_run_along_a_given_table_is_saved(tmp_path: Path) -> None:
     """A table in memory has no file that the check of the plan could read."""
     level = [0.0] * 4

@@ -42,6 +42,7 @@ def by_override(folder: Path) -> Scene:
     return loader.load(folder / "plain.yaml", {"vehicle.model": "table.xml"})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("load", [by_file, by_override])
 def test_another_model_brings_its_own_mass_properties(load, folder: Path) -> None:
     """afit_simsat's are 80 kg, 6 to 9 kg m2 and tens of micrometers; Steiner's term is 3e-6 kg m2."""

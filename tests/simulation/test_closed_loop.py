@@ -177,6 +177,7 @@ def test_the_filter_allows_for_the_survey_s_error() -> None:
     assert np.degrees(error[late]).min() * 3600 > 60  # 0.5 mm of lever are 85 arcsec at 1.2 m
 
 
+@pytest.mark.slow
 def test_the_star_tracker_restores_attitude_and_bias(bumped: Bumped) -> None:
     telemetry = bumped.telemetry
     assert telemetry.lab_from_filter is not None

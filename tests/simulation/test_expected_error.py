@@ -581,6 +581,7 @@ def test_coma_adds_to_the_error_of_solved_frames_what_check_counts() -> None:
     assert np.sqrt(every[:, 0].mean() / total) == pytest.approx(1, abs=0.25)
 
 
+@pytest.mark.slow
 def test_colors_in_the_air_turn_solutions_as_check_counts() -> None:
     """Frames without noise, and equal weights, so that the colors alone make the difference."""
     keys = SLOW_TURN | {

@@ -135,6 +135,7 @@ def test_an_option_without_effect_is_refused_in_a_head_too(tmp_path: Path) -> No
         load_scene(path)
 
 
+@pytest.mark.slow
 def test_the_expected_roll_of_two_heads_is_from_the_other_s_boresight() -> None:
     """At a right angle the roll about one boresight is an angle across the other: 1 / roll^2 + 2 / cross^2."""
     steady = {"kind": "steady", "temperature_c": 20.0}

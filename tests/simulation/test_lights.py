@@ -152,6 +152,7 @@ def test_a_blinking_user_light_is_in_the_frames_in_which_it_is_lit() -> None:
             assert truth.sources.electrons[row] == pytest.approx(light_e, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_not_know() -> (
     None
 ):
@@ -162,6 +163,7 @@ def test_the_check_counts_a_lighthouse_among_the_lights_that_the_tracker_does_no
     assert facts["lights_in_the_field"] == same["lights_in_the_field"]
 
 
+@pytest.mark.slow
 def test_a_curtain_hides_earlier_lights_and_the_forecast_names_it() -> None:
     """Lamp and LEDs beyond it are absent from the frame and listed as hidden; those before it are unchanged."""
     lamp = LAMP.replace("[0 m, ", "[0.03 m, ")
@@ -231,6 +233,7 @@ BEHIND = (
 )
 
 
+@pytest.mark.slow
 def test_the_forecast_and_the_run_agree_on_stars_behind_the_earth() -> None:
     """The camera looks at the Earth; half a revolution later the same stars are before it."""
     keys = {"exposure.frames": "2", "orbit": BEHIND}
@@ -270,6 +273,7 @@ def test_the_forecast_applies_the_air_as_the_frames_do() -> None:
     assert any("all behind the skyline" in line for line in found.findings)
 
 
+@pytest.mark.slow
 def test_a_head_that_looks_at_the_earth_is_warned_of_by_its_key() -> None:
     """The main camera looks away from the Earth, the head opposite to it, through the payload's skin."""
     head = '[{name: back, position: ["0 m", "0 m", "0 m"], rotation_deg: [0, 180, 0]}]'
@@ -285,6 +289,7 @@ def test_a_head_that_looks_at_the_earth_is_warned_of_by_its_key() -> None:
     assert behind[0].startswith("heads.0.rotation_deg: ")
 
 
+@pytest.mark.slow
 def test_the_page_s_lighthouse_is_a_light(tmp_path: Path) -> None:
     """The block of docs/howto/light.md as a program prints what the page says."""
     page = (ROOT / "docs/howto/light.md").read_text(encoding="utf-8")

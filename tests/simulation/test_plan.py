@@ -685,6 +685,7 @@ def test_similar_fields_are_those_that_the_tracker_refuses_as_ambiguous(layout: 
     )
 
 
+@pytest.mark.slow
 def test_fields_of_coded_leds_are_not_called_similar() -> None:
     """The same spiral with its codes and without."""
     any_attitude = {"motion__control": "null", "motion__maneuver": "[]"}

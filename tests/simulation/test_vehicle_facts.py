@@ -90,6 +90,7 @@ def test_a_maneuver_beyond_the_exposures_is_stated() -> None:
     assert len(maneuver_of(lab_of("simsat_slew", exposure__frames=frames, **changes))) == 1
 
 
+@pytest.mark.slow
 def test_joints_that_nothing_drives_and_the_file_s_own_parts_are_named(
     tmp_path: Path,
 ) -> None:

@@ -983,6 +983,7 @@ def test_a_file_of_too_many_leds_is_refused_before_its_rows_are_read(
         listed.read_csv(path)
 
 
+@pytest.mark.slow
 def test_leds_that_all_are_in_one_place_are_refused_in_linear_time(tmp_path: Path) -> None:
     """The pairs of 100,000 LEDs in one place would be five billion."""
     path = tmp_path / "leds.csv"

@@ -235,6 +235,7 @@ def test_circles_on_a_sphere_have_their_spacing_and_circumference() -> None:
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", SURFACES.values(), ids=SURFACES)
 def test_strips_follow_meridians_with_leds_a_pitch_apart_to_the_rim(
     on: dict[str, Any],

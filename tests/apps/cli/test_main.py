@@ -792,6 +792,7 @@ def test_check_prints_facts_and_warnings_in_eighty_columns(skysim: Skysim) -> No
     assert "no warnings" in skysim("check", "shefex2").out
 
 
+@pytest.mark.slow
 def test_check_as_json_has_numbers_and_findings(skysim: Skysim) -> None:
     report = json.loads(
         skysim("check", "afit_simsat", "--json", "--set", "light.layout.cap_deg=15").out
@@ -828,6 +829,7 @@ def test_a_run_shows_the_check_s_findings_before_its_frames_and_in_its_report(
         assert name in page[page.index("<h2>Scene") : page.index("<h2>Frames")]
 
 
+@pytest.mark.slow
 def test_validate_shows_the_check_s_findings(skysim: Skysim, tmp_path: Path) -> None:
     path = tmp_path / "mine.yaml"
     path.write_text("schema: 1\nbase: afit_simsat\nlight:\n  led: {intensity: 60 mcd}\n")

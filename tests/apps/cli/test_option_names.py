@@ -70,6 +70,7 @@ def test_no_key_of_the_table_is_a_key_of_a_scene_or_a_study() -> None:
     assert PARAMETERS.isdisjoint(keys)
 
 
+@pytest.mark.slow
 def test_every_parameter_at_fault_below_the_apps_is_in_the_table() -> None:
     found = {
         key for key in raised_keys() if "." in key and key.partition(".")[0] in PARAMETERS

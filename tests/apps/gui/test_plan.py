@@ -47,6 +47,7 @@ pytest_plugins = ["tests.helpers.labpage"]
 ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 
 
+@pytest.mark.slow
 def test_a_check_equals_that_of_the_command() -> None:
     lab = build_lab(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
     found = Worker(SimpleNamespace(lab=lab)).check()

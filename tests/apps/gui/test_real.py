@@ -86,6 +86,7 @@ def test_a_file_is_taken_when_it_is_complete_and_once(tmp_path: Path) -> None:
     assert source.picture() is None
 
 
+@pytest.mark.slow
 def test_a_real_frame_s_attitude_is_near_the_true_one_and_moves_the_simulation(
     worker: Worker, laboratory: Lab, tmp_path: Path
 ) -> None:
@@ -129,6 +130,7 @@ def test_the_difference_of_like_frames_is_noise_whatever_their_brightness() -> N
     assert not blank["difference"].any()
 
 
+@pytest.mark.slow
 def test_the_survey_by_real_frames_finds_the_true_focal_length(
     worker: Worker, laboratory: Lab, tmp_path: Path
 ) -> None:
@@ -160,6 +162,7 @@ def test_a_picture_of_another_size_is_refused_and_the_sky_has_no_survey(
     assert compared(worker, tmp_path, False) is False
 
 
+@pytest.mark.slow
 def test_a_sky_frame_is_solved_by_the_scene_s_star_tracker(tmp_path: Path) -> None:
     lab = build_lab(loader.load("shefex2"))
     for frame, truth in survey_frames.render_stops(lab, Rotation.concatenate([lab.start])):

@@ -45,6 +45,7 @@ def test_the_arrows_have_the_rms_that_the_tracker_reports(name: str) -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_mean_residual_of_an_led_points_to_its_true_place() -> None:
     """The place errors of a dome's map, seen from the camera, less what the attitude takes of them."""
     bench = Workbench.open("afit_simsat", {"exposure.frames": "12"})

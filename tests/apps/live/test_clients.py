@@ -85,6 +85,7 @@ def test_a_client_turns_the_vehicle_over_the_wire(language: str, tmp_path: Path)
     assert server.counters()["dropped"] == {}
 
 
+@pytest.mark.slow
 def test_the_page_s_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     lines = block("sh", "--tcp 8091") + block("sh", "--display")

@@ -114,6 +114,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Flown:
     return Flown(live, packets, read(path), sink)
 
 
+@pytest.mark.slow
 def test_the_file_has_every_packet(flown: Flown) -> None:
     packets = flown.packets
     assert len(packets["frame"]) == FRAMES

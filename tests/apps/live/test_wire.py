@@ -132,6 +132,7 @@ def test_a_line_that_is_no_object_is_refused(line: bytes) -> None:
         parse(line)
 
 
+@pytest.mark.slow
 def test_a_torque_turns_as_newton_says_and_ends_at_its_timeout() -> None:
     """J dw = T t for 0.2 s; then the timeout of 0.5 s, and the law again."""
     live = live_flight(**{"vehicle.center_of_mass": "[0 mm, 0 mm, 0 mm]"})

@@ -590,6 +590,7 @@ def test_a_record_s_times_ascend_within_those_of_its_wheels() -> None:
         record_of([0, 1, 2], [0, 1, 2, 3, 4], 3)
 
 
+@pytest.mark.slow
 def test_the_misfit_of_a_fit_is_one_where_the_errors_are_as_assumed() -> None:
     """Three numbers an attitude less six of the start: of 40 records with drawn noise; less with more noise."""
     found = []

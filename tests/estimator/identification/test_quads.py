@@ -211,6 +211,7 @@ def test_a_correct_focal_length_is_kept() -> None:
         assert (solution.focal_ratio == 1.0) == (ratio == 1.0)
 
 
+@pytest.mark.slow
 def test_a_calibrated_tracker_finds_that_its_focal_length_is_wrong() -> None:
     camera = Camera.from_fov(659, 494, fov_deg=14.87)
     rng = np.random.default_rng(17)

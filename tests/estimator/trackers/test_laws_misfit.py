@@ -80,6 +80,7 @@ def test_understated_noise_is_found_from_the_misfit(tracker: StarTracker, times:
     assert 2 < errors_squared(tracker, CAMERA, 1 / times).mean() < 4.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "lens",
     [CAMERA.zoomed(1.003), replace(CAMERA, distortion=(0.15, 0.0, 0.0, 0.0, 0.0))],

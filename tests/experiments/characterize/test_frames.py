@@ -387,6 +387,7 @@ def command(
     return int(left.value.code or 0), *capsys.readouterr()
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_preset_that_a_scene_takes(
     good: Path,
     tmp_path: Path,

@@ -505,6 +505,7 @@ def test_the_command_repeats_scene_options_and_fields(sheet: MeasuredFrames) -> 
     )
 
 
+@pytest.mark.slow
 def test_only_the_first_three_sections_are_printed_on_a_terminal(
     whole: Statement, tmp_path: Path
 ) -> None:

@@ -140,6 +140,7 @@ def test_the_tracker_measures_the_catalog_s_magnitudes() -> None:
     assert np.median(np.abs(error_mag)) < 0.04
 
 
+@pytest.mark.slow
 def test_magnitudes_are_in_the_index_only_if_they_are_known() -> None:
     lab = build_lab(loader.load("ptase_monte_carlo"))
     assert np.isfinite(build_tracker(lab.camera).index.magnitude).all()

@@ -169,6 +169,7 @@ def test_rows_beyond_the_limit_are_moved_to_parts(tmp_path: Path) -> None:
     assert whole(path)["trial"] == list(range(POINTS * EACH))
 
 
+@pytest.mark.slow
 def test_rows_of_store_and_parts_are_one_table(both: tuple[Path, Path]) -> None:
     one, other = both
     assert (in_sqlite(one), in_sqlite(other)) == (120, 20)

@@ -328,7 +328,7 @@ def many(factors: int, values: int) -> str:
             "design: factorial of 39062500000000 points; .*100000",
         ),
         (2, 317, "factorial", "design: factorial of 100489 points; .*100000"),
-        (1, 90_000, "factorial", "factors: 90000 levels; allowed: up to 1000"),
+        (1, 9_000, "factorial", "factors: 9000 levels; allowed: up to 1000"),
         (3, 400, "one_at_a_time", "factors: 1200 levels; allowed: up to 1000"),
         (101, 2, "one_at_a_time", "factors: .*; allowed: at most 100 values"),
         (1, 3, "saltelli, points: 65536", "saltelli of 196608 points"),

@@ -502,6 +502,7 @@ def tracked_statuses(settings: dict[str, Any], seeds: range) -> list[str]:
     return [trials.run_frame_trial(setup, seed).status for seed in seeds]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gyro", [False, True])
 def test_tracking_follows_a_motion_until_its_prediction_leaves_the_windows(gyro):
     """The mean rate of the last two frames misses by a t^2, and streaks tell its change until stars are too smeared.
