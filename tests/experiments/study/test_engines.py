@@ -495,6 +495,28 @@ def test_a_lost_scheduler_is_reported_and_received_rows_are_kept(
     assert contents(path) == serial_contents
 
 
+@pytest.mark.long
+def test_a_cluster_without_workers_is_reported_and_received_rows_are_kept(
+    plan_: plan.Plan, serial_contents: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("distributed")
+    from skysim.experiments.study.execution import dask_engine
+
+    monkeypatch.setattr(dask_engine, "IDLE_S", 2.0)
+    path = tmp_path / "alone.sqlite"
+    for cluster in cluster_of(tmp_path, "--no-nanny"):
+        engine = on_dask(cluster, 1)
+
+        def kill(progress: runner.Progress, worker: Any = cluster.workers[0]) -> None:
+            if progress.now >= 30:
+                worker.kill()
+
+        with pytest.raises(InputError, match=r"scheduler: no worker for 2 s, .* resume"):
+            done(plan_, path, engine, watch=kill)
+    done(plan_, path, engines.Serial(), resume=True)
+    assert contents(path) == serial_contents
+
+
 CTRL_C = """
 import os, signal, time
 from skysim.experiments.study.execution import workers

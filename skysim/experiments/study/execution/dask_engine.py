@@ -39,6 +39,7 @@ except ImportError:
     ) from None
 
 WAIT_S = 10.0  # timeout for a reply
+IDLE_S = 60.0  # for which a cluster may have no worker
 POLL_S = 5.0  # interval between queries of the cluster's thread count, because workers join and leave
 Submission = tuple[Chunk, bool]  # a submitted chunk, and whether it is the only one in flight
 ADDRESS = "a scheduler's address, such as tcp://10.0.0.1:8786"
@@ -144,6 +145,7 @@ def collect_rows(
         if not in_flight:
             return
         rows: list[Any] = []
+        wait_for_results(client, completed)
         for future, result in completed.next_batch():
             chunk, was_alone = in_flight.pop(future)
             if future.status == "finished":
@@ -159,6 +161,26 @@ def collect_rows(
                     retries.extend(split_chunk(chunk))
         if rows:
             yield rows
+
+
+def wait_for_results(client: Client, completed: as_completed) -> None:
+    """Return once a chunk is completed. Raises InputError if the cluster has had no worker for IDLE_S.
+
+    The scheduler keeps the chunks of lost workers for others, which may never come.
+    """
+    seen_s = polled_s = time.monotonic()
+    while not completed.has_ready():
+        time.sleep(0.002)
+        if time.monotonic() - polled_s >= min(POLL_S, IDLE_S):
+            polled_s = time.monotonic()
+            if thread_count(client):
+                seen_s = polled_s
+            if polled_s - seen_s >= IDLE_S:
+                raise InputError(
+                    "scheduler",
+                    f"no worker for {IDLE_S:.0f} s, finished trials are stored",
+                    "to resume with new workers",
+                )
 
 
 def encode_chunk(chunk: Chunk) -> str:
