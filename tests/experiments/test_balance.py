@@ -145,11 +145,17 @@ def test_trim_masses_move_to_cancel_the_moment() -> None:
     )
     np.testing.assert_allclose(moved.mass.center_m, 0, atol=1e-10)
     assert np.abs(position_m - vehicle.trims.position_m).max() > 1e-3
-    with pytest.raises(
-        InputError,
-        match=r"trim_. would have to go to .* mm; allowed: vehicle.trim.travel 20 mm: first",
-    ):
-        balance_procedure.balanced_position_m(vehicle, 10 * np.ones(3) * 1e-3, scene)
+    heavy_kg_m = 1e-2 * np.ones(3)
+    lever_kg = vehicle.trims.axes * vehicle.trims.mass_kg
+    needed_m = vehicle.trims.position_m - np.linalg.solve(lever_kg, heavy_kg_m)
+    beyond_g_mm = 1e6 * vehicle.trims.mass_kg * (np.abs(needed_m) - 0.02)
+    with pytest.raises(InputError, match=r"trim_. would have to go to .* mm;") as refused:
+        balance_procedure.balanced_position_m(vehicle, heavy_kg_m, scene)
+    ballast = f"by {beyond_g_mm[np.argmax(np.abs(needed_m))]:.3g} g mm"
+    assert (
+        f"allowed: vehicle.trim.travel 20 mm: first move ballast along its axis, {ballast}"
+        in (str(refused.value))
+    )
 
 
 @pytest.mark.parametrize(

@@ -210,7 +210,7 @@ def test_the_paths_of_images_are_those_of_a_constant_rate(rng: np.random.Generat
     along = streak_px / length_px
     ends_px = np.sum(((path[0] + path[-1]) / 2 - path.mean(axis=0)) * along, axis=1)
     expected = ends_px[:, None] * along
-    assert_allclose(ahead_px, expected, rtol=0, atol=0.03 * np.abs(expected).max() + 1e-4)
+    assert_allclose(ahead_px, expected, rtol=0, atol=0.012 * np.abs(expected).max() + 1e-4)
     assert rate.image_paths(camera, found.take(np.arange(2)), exposure_s) is None
 
 

@@ -242,7 +242,13 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     diagonal = np.zeros((count, STATE, STATE))
     border = np.zeros((count, STATE, size + 1))
     corner = np.zeros((size + 1, size + 1))
-    mass_properties.add_measured(RECORD, states, lab, values, (diagonal, border, corner))
+    blocks = diagonal, border, corner
+    chi2 = mass_properties.add_measured(RECORD, states, lab, values, blocks)
+    # A first torque of two standard deviations about each axis adds four for each.
+    pushed = states._replace(torque=states.torque + 2 * lab.torque_rms_nm[:, None])
+    without = tuple(map(np.copy, blocks))
+    added = mass_properties.add_measured(RECORD, pushed, lab, values, without)
+    assert added - chi2 == pytest.approx(12)
     whole[STATE * count :, STATE * count :] += corner
     for k in range(count):
         at = slice(STATE * k, STATE * (k + 1))

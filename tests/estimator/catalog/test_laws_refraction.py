@@ -125,6 +125,7 @@ def test_the_zenith_matches_erfa(
     [
         ({"latitude_deg": 91.0}, "latitude_deg"),
         ({"pressure_hpa": -1.0}, "pressure_hpa"),
+        ({"wavelength_m": 2.9e-7}, "wavelength_m"),
         ({"epoch": "now"}, "date"),
     ],
 )
