@@ -401,10 +401,11 @@ def normal(row: Any, state: Any, memory: Scratch) -> Any:
     # 3. More bits for the smallest u.
     if rare:
         state = _lengthen(radius[:half], words, state)
-    # 4. The second half of the draws gives the angles.
+    # 4. The second half of the draws gives the angles. Slices, since an index half + n might be negative for numba.
     second = row[half:]
-    for n in range(row.size - half):
-        x, y = _direction(words[half + n])
+    angles = words[half:]
+    for n in range(second.size):
+        x, y = _direction(angles[n])
         row[n] = radius[n] * x
         second[n] = radius[n] * y
     # A row of odd width has one pixel without a partner.
