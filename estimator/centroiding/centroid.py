@@ -49,7 +49,10 @@ def _moments(
     """
     image = prepare(image, blobs, gain_e_dn, priors)
     sky = blobs.background
-    return _to_centroids(kernel(image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)))
+    every = np.arange(len(blobs))
+    return _to_centroids(
+        kernel(image, blobs.box_px, every, sky.level, sky.noise, float(gain_e_dn))
+    )
 
 
 cog = partial(_moments, moments.center_of_gravity)
@@ -398,12 +401,12 @@ def _frame_streaks(image: NDArray, blobs: Blobs, priors: FramePriors) -> Floats:
 
 def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float) -> Floats:
     """Replace the rows that are NaN by those of the center of gravity, in place."""
-    failed = np.isnan(rows[:, 0])
-    if failed.any():
+    failed = np.flatnonzero(np.isnan(rows[:, 0]))
+    if len(failed):
         sky = blobs.background
         rows[failed] = moments.center_of_gravity(
-            image, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
-        )[failed]
+            image, blobs.box_px, failed, sky.level, sky.noise, float(gain_e_dn)
+        )
     return rows
 
 

@@ -32,9 +32,9 @@ MAX_ITERATIONS = 60
 
 @jit
 def center_of_gravity(
-    image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
+    image: NDArray, boxes: Ints, chosen: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
-    """Compute the center of gravity in each box and a margin: (N, 4) x, y, sigma of the position, flux.
+    """Compute the center of gravity in K chosen boxes and a margin: (K, 4) x, y, sigma of the position, flux.
 
     With the light I_i above the sky at pixel x_i, and F = sum I_i,
 
@@ -43,14 +43,14 @@ def center_of_gravity(
     as dxbar/dI_i = (x_i - xbar) / F. The same holds for y, and sigma^2 = (var(xbar) + var(ybar)) / 2. Pixels nearer to
     another blob's box are excluded.
     """
-    return _weighted_mean(image, boxes, level, noise, gain_e_dn, MARGIN_PX, 1)
+    return _weighted_mean(image, boxes, chosen, level, noise, gain_e_dn, MARGIN_PX, 1)
 
 
 @jit
 def squared_light(
-    image: NDArray, boxes: Ints, level: Floats, noise: Floats, gain_e_dn: float
+    image: NDArray, boxes: Ints, chosen: Ints, level: Floats, noise: Floats, gain_e_dn: float
 ) -> Floats:
-    """Compute the mean position weighted by the squared light: (N, 4) x, y, sigma of the position, flux.
+    """Compute the mean position in K chosen boxes, weighted by the squared light: (K, 4) x, y, sigma, flux.
 
     With the positive light I_i above the sky, W = sum I_i^2 and dc/dI_i = 2 I_i (x_i - c) / W,
 
@@ -58,23 +58,25 @@ def squared_light(
 
     The sampling variance is that of the squared profile, whose variance is sum(I_i^2 (x_i - c)^2) / W.
     """
-    return _weighted_mean(image, boxes, level, noise, gain_e_dn, 1, 2)
+    return _weighted_mean(image, boxes, chosen, level, noise, gain_e_dn, 1, 2)
 
 
 @jit
 def _weighted_mean(
     image: NDArray,
     boxes: Ints,
+    chosen: Ints,
     level: Floats,
     noise: Floats,
     gain_e_dn: float,
     margin: int,
     power: int,
 ) -> Floats:
-    """Compute the mean position weighted by a power of the light, 1 or 2, in each box and a margin."""
+    """Compute the mean position weighted by a power of the light, 1 or 2, in each chosen box and a margin."""
     height, width = image.shape
-    out = np.zeros((len(boxes), 4))
-    for n in range(len(boxes)):
+    out = np.zeros((len(chosen), 4))
+    for k in range(len(chosen)):
+        n = chosen[k]
         x0, y0, x1, y1 = _window(boxes[n], margin, width, height)
         neighbor_rows = neighbors(boxes, n, x0, y0, x1, y1)
         light = np.zeros((y1 - y0 + 1, x1 - x0 + 1))
@@ -91,7 +93,7 @@ def _weighted_mean(
         share = light if power == 1 else positive**2
         total = share.sum()
         if total == 0:  # the mean is undefined
-            out[n, :3] = np.nan
+            out[k, :3] = np.nan
             continue
         across = np.arange(x0, x1 + 1)
         down = np.arange(y0, y1 + 1).reshape(-1, 1)
@@ -105,7 +107,7 @@ def _weighted_mean(
         variance = noise2.sum() / total**2
         if power == 2:
             variance += sampling_variance((share * distance2).sum() / total)
-        out[n] = cx, cy, sqrt(variance), light.sum()
+        out[k] = cx, cy, sqrt(variance), light.sum()
     return out
 
 

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import float32, float64, int32, int64, uint8, uint16, uint32, uint64
+from numba.cpython.unsafe.numbers import trailing_zeros
 from numpy.random import Generator
 from numpy.typing import NDArray
 
@@ -178,11 +179,11 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
     found = memory.found
     width = row.size
     bits = memory.bits[: (row.size + 3) // 4]
-    # 1. Large means alone.
-    least = float32(INVERSION_MAX_E)
+    # 1. Large means alone. A sum, since compilers do not make vector instructions of a minimum of floats.
+    small = 0
     for x in range(width):
-        least = min(least, row[x])
-    if least == float32(INVERSION_MAX_E):
+        small += row[x] < float32(INVERSION_MAX_E)
+    if small == 0:
         for x in range(width):
             late[x] = x
         return _count_large(row, late[:width], state, memory)
@@ -231,11 +232,12 @@ def _marked(found: Any, late: Any) -> int:
     eights = found.view(np.uint64)
     count = 0
     for n in range(eights.size):
-        if eights[n] & uint64(EIGHT_BITS):
-            for x in range(8 * n, 8 * n + 8):
-                if found[x] >= LARGE_BIT:
-                    late[count] = x
-                    count += 1
+        marks = eights[n] & uint64(EIGHT_BITS)
+        while marks:
+            late[count] = 8 * n + (trailing_zeros(marks) >> 3)
+            count += 1
+            # Without the lowest mark.
+            marks &= marks - uint64(1)
     return count
 
 
@@ -263,7 +265,8 @@ def _count_large(row: Any, pixels: Any, state: Any, memory: Scratch) -> Any:
     3. The rest go to `_correct`, which accepts or replaces them so that the law is exact.
     """
     count = pixels.size
-    found = memory.found
+    # Whole eights.
+    found = memory.found[: (count + 7) // 8 * 8]
     counts = memory.normals[:count]
     means = memory.means[:count]
     # 1. Normal numbers first, then a uniform number of 32 bits for each pixel.
@@ -398,10 +401,11 @@ def normal(row: Any, state: Any, memory: Scratch) -> Any:
     # 3. More bits for the smallest u.
     if rare:
         state = _lengthen(radius[:half], words, state)
-    # 4. The second half of the draws gives the angles.
+    # 4. The second half of the draws gives the angles. Slices, since an index half + n might be negative for numba.
     second = row[half:]
-    for n in range(row.size - half):
-        x, y = _direction(words[half + n])
+    angles = words[half:]
+    for n in range(second.size):
+        x, y = _direction(angles[n])
         row[n] = radius[n] * x
         second[n] = radius[n] * y
     # A row of odd width has one pixel without a partner.

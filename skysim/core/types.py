@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.quaternion import interpolate
+from skysim.core.quaternion import from_rotation, interpolate, to_rotation
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -172,8 +172,7 @@ class Trajectory:
         end = self.rate_body_rad_s[1:] * step
         # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
         end = end + np.cross(rotvec, end) / 2
-        wxyz = self.lab_from_body.as_quat(scalar_first=True)
-        return wxyz, np.stack([rotvec, begin, end], axis=1)
+        return from_rotation(self.lab_from_body), np.stack([rotvec, begin, end], axis=1)
 
     def attitude_at(self, t_s: float | Floats) -> Rotation:
         """lab_from_body at any time within the history. Raises ValueError outside of it.
@@ -190,10 +189,8 @@ class Trajectory:
             np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2
         )
         fraction = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
-        lab_from_body = Rotation.from_quat(
-            interpolate(*self.hermite_segments, k, fraction), scalar_first=True
-        )
-        return lab_from_body if np.ndim(t_s) else lab_from_body[0]
+        wxyz = interpolate(*self.hermite_segments, k, fraction)
+        return to_rotation(wxyz if np.ndim(t_s) else wxyz[0])
 
     def means(self, t_s: Floats) -> tuple[Rotation, Floats]:
         """Means of lab_from_body and of the rate in body axes over an interval, from an odd number of even times (K,).

@@ -122,6 +122,8 @@ class DisturbanceModel:
         Knocks in order of time
     inertia_kg_m2
         (3, 3) inertia about the bearing, in body axes
+    inactive
+        Whether there is no disturbance
     """
 
     def __init__(
@@ -139,15 +141,8 @@ class DisturbanceModel:
         self.air_current = AirCurrent(air, period_s, rng) if air else None
         self.impulses = impulses
         self.inertia_kg_m2 = inertia_kg_m2
-
-    @property
-    def inactive(self) -> bool:
-        """Whether there is no disturbance."""
-        return not (
-            self.turbine_lab_nm.any()
-            or self.earth_lab_rad_s.any()
-            or self.air_current
-            or self.impulses
+        self.inactive = not (
+            self.turbine_lab_nm.any() or self.earth_lab_rad_s.any() or air or impulses
         )
 
     def torque_nm(

@@ -12,6 +12,7 @@ Another program may replace the law by a torque, or single motors' commands (`Co
 
 import math
 from collections.abc import Mapping
+from functools import reduce
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -159,7 +160,7 @@ class FlightComputer:
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) momentum stored in wheels and CMGs, in body axes; the arguments are the full qpos and qvel."""
         sets = self.actuator_sets.values()
-        return np.sum([one.momentum_nms(angles_rad, speeds_rad_s) for one in sets], axis=0)
+        return reduce(np.add, [one.momentum_nms(angles_rad, speeds_rad_s) for one in sets])
 
     def compute_controls(
         self,

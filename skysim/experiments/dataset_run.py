@@ -72,6 +72,7 @@ AS_IT_IS: Record = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
+WHOLE_BYTES = 1 << 30  # larger than a file of a tar, so that each is written at once
 
 
 @frozen
@@ -353,7 +354,9 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     name = shard_name(SHARDS, shard, "tar")
     with storage.writer(name) if "webdataset" in plan.formats else nullcontext() as file:
         tar = (
-            tarfile.TarFile(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
+            tarfile.TarFile(
+                fileobj=file, mode="w", format=tarfile.USTAR_FORMAT, copybufsize=WHOLE_BYTES
+            )
             if file
             else None
         )

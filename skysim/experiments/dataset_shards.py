@@ -200,12 +200,13 @@ def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray, Floats]:
 def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Ints:
     """(M,) number of the first free source within reach of each detection; -1 if there is none."""
     chosen = np.full(len(found_px), -1)
-    is_free = np.ones(len(source_px), np.bool_)
-    for m, place in enumerate(found_px):
-        near = is_free & (np.sum((source_px - place) ** 2, axis=1) <= reach_px**2)
-        if near.any():
-            chosen[m] = np.argmax(near)
-            is_free[chosen[m]] = False
+    x_px, y_px = map(np.subtract.outer, found_px.T, source_px.T)
+    used = set[int]()
+    # All pairs within reach, detection by detection.
+    for m, n in np.argwhere(x_px**2 + y_px**2 <= reach_px**2).tolist():
+        if chosen[m] < 0 and n not in used:
+            chosen[m] = n
+            used.add(n)
     return chosen
 
 
@@ -432,13 +433,14 @@ def frame_labels(one: LabelledFrame, scene: Scene, numbers: Record) -> Record:
         "exposure_s": frame.exposure_s,
         "saturation_dn": frame.saturation_dn,
     }
+    attitudes = {name: getattr(truth, name) for name in ATTITUDES}
     vectors = {
-        tuple(f"{name}_q{end}" for end in "xyzw"): getattr(truth, name).as_quat()
-        for name in ATTITUDES
+        tuple(f"{name}_q{end}" for end in "xyzw"): attitude.as_quat()
+        for name, attitude in attitudes.items()
     }
     vectors[tuple(f"rate_cam_{end}_rad_s" for end in "xyz")] = truth.rate_cam_rad_s
     if isinstance(scene.light, StarsConfig):
-        angles_rad = ra_dec_roll_rad(truth.mean_cam_from_lab)
+        angles_rad = ra_dec_roll_rad(attitudes["mean_cam_from_lab"])
         vectors["ra_deg", "dec_deg", "roll_deg"] = np.degrees(angles_rad)
     for names, values in vectors.items():
         labels |= zip(names, values.tolist(), strict=True)

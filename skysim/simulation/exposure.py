@@ -272,8 +272,11 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
     hidden = [np.zeros(0, np.int64)]
     for lit in beam.lits:
         if lit.points is not None and lit.occlusion is not None:
-            seen = lit.points.take(on_detector(lit.points, exposure)[0])
-            hidden.append(seen.id[lit.occlusion(seen.place)])
+            near = in_view(lit.points, exposure.optics, exposure.pose, reach=0.0)
+            behind = lit.points.take(near[lit.occlusion(lit.points.place[near])])
+            # Most exposures have none.
+            if len(behind):
+                hidden.append(behind.id[on_detector(behind, exposure)[0]])
     return Truth(
         exposure.t_s,
         exposure.lab_from_body,

@@ -19,6 +19,7 @@ from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
 from skysim.core.errors import InputError
 from skysim.core.plugins import finite_array
+from skysim.core.quaternion import to_rotation
 from skysim.core.text import LARGEST
 from skysim.core.types import Floats, Frame, Telemetry, Trajectory, Truth, frozen
 from skysim.dynamics import imu
@@ -274,7 +275,7 @@ class Flight:
         vehicle = self.lab.vehicle
         return State(
             self.now_s,
-            Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True),
+            to_rotation(simulation.lab_from_body_wxyz),
             simulation.rate_body_rad_s.copy(),
             simulation.speeds_rad_s[vehicle.wheels.dof],
             simulation.angles_rad[vehicle.gimbals.qpos],

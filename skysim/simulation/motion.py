@@ -23,6 +23,7 @@ from scipy.spatial.transform import Rotation
 from skysim.camera import as_built
 from skysim.core.errors import InputError
 from skysim.core.plugins import NO_PROGRAMS, Programs
+from skysim.core.quaternion import to_rotation
 from skysim.core.random_streams import AIR_CURRENT, IMU, random_stream
 from skysim.core.types import Bools, Floats, Mounting, Record, Telemetry, Trajectory, lengths
 from skysim.core.units import significant
@@ -399,8 +400,8 @@ class Motion:
         navigation = self.navigation
         angles = simulation.angles_rad
         speeds = simulation.speeds_rad_s
-        attitude = simulation.lab_from_body_wxyz
-        rate = simulation.rate_body_rad_s
+        attitude = angles[:4]
+        rate = speeds[:3]
         momentum = flight_computer.momentum_nms(angles, speeds)
         # 1. The controller gets the truth or, with feedback imu or filter, the estimates of the navigation.
         measured_attitude = attitude
@@ -414,7 +415,7 @@ class Motion:
             simulation.now_s, flight_computer.period_s, measured_rate, angles, speeds
         )
         held = flight_computer.compute_controls(inputs, measured_attitude, momentum, commands)
-        control = np.tile(held, (min(steps, simulation.steps_left), 1))
+        control = held[None].repeat(min(steps, simulation.steps_left), axis=0)
         # 3. Disturbances act through the model's ideal torque actuators. They change at every step; commands do not.
         mean_nm = np.zeros(3)
         if not (self.disturbances.inactive or self.lab.scene.motion.is_prescribed):
@@ -467,12 +468,13 @@ class Motion:
                         if name.startswith("mounting")
                     ],
                 )
-        count = math.ceil(simulation.last_step / self.period_steps)
+        number = simulation.step // self.period_steps
         for name, value in row.items():
-            one = np.asarray(value)
             if name not in self.rows:
+                one = np.asarray(value)
+                count = math.ceil(simulation.last_step / self.period_steps)
                 self.rows[name] = np.zeros((count, *one.shape), one.dtype)
-            self.rows[name][simulation.step // self.period_steps] = one
+            self.rows[name][number] = value
 
     def telemetry(self) -> Telemetry:
         """The rows so far as Telemetry; there is no commanded attitude without a controller."""
@@ -508,11 +510,11 @@ class Motion:
             }
         for name in rows:
             if name.startswith("lab_from"):
-                rows[name] = Rotation.from_quat(rows[name], scalar_first=True)
+                rows[name] = to_rotation(rows[name])
         return Telemetry(
             t_s,
             self.flight_computer.period_s,
-            Rotation.from_quat(states[:, 1:5], scalar_first=True),
+            to_rotation(states[:, 1:5]),
             states[:, 1 + nq : 4 + nq].copy(),
             wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
             gimbal_rad=gimbals,

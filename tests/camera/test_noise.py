@@ -132,6 +132,16 @@ def test_noise_of_neighbors_and_rows_is_independent() -> None:
             assert abs(r) < 4.5 / np.sqrt(a.size)
 
 
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 1.0])
+def test_marked_entries_are_found_in_order(share: float) -> None:
+    rng = np.random.default_rng(6)
+    found = rng.integers(0, noise.LARGE_BIT, 1600, dtype=np.uint8)
+    found[rng.random(1600) < share] |= noise.LARGE_BIT
+    late = np.empty(1600, np.int32)
+    count = noise._marked(found, late)
+    np.testing.assert_array_equal(late[:count], np.flatnonzero(found >= noise.LARGE_BIT))
+
+
 def test_counts_and_the_numbers_that_follow_are_independent() -> None:
     """A bright pixel must be independent of the next one, though both use one random stream."""
     for mean in (0.3, 5.0, 50.0):

@@ -46,6 +46,19 @@ def test_products_and_rotated_vectors_match_scipy(one: list[float], two: list[fl
     )
 
 
+@pytest.mark.parametrize("count", [None, 0, 1, 5])
+def test_rotations_are_those_of_scipy_with_the_scalar_first(count: int | None) -> None:
+    turned = Rotation.random(count, rng=np.random.default_rng(4))
+    wxyz = turned.as_quat(scalar_first=True)
+    np.testing.assert_array_equal(quaternion.from_rotation(turned), wxyz)
+    np.testing.assert_array_equal(
+        quaternion.to_rotation(wxyz).as_quat(),
+        Rotation.from_quat(wxyz, scalar_first=True).as_quat(),
+    )
+    # Compiled functions are compiled again for another order in memory.
+    assert quaternion.from_rotation(turned).flags.c_contiguous
+
+
 def test_the_cross_product_matches_numpy() -> None:
     a = np.array([1.0, -2.0, 0.5])
     b = np.array([0.3, 4.0, -7.0])

@@ -73,7 +73,7 @@ class Actuators:
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
-        control[self.motor] = given = np.clip(commands, -self.limit, self.limit)
+        control[self.motor] = given = commands.clip(-self.limit, self.limit)
         return self.torque(given)
 
     def torque(self, commands: Floats) -> Floats:

@@ -17,13 +17,14 @@ from mujoco.rollout import Rollout
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.quaternion import to_rotation
 from skysim.core.types import Floats, Trajectory
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.model import VehicleModel, set_start
 from skysim.dynamics.multibody.wheels import Stiction
 
-STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS
-CONTROL = mujoco.mjtState.mjSTATE_CTRL
+STATE = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+CONTROL = int(mujoco.mjtState.mjSTATE_CTRL)
 MAX_STEPS = 2**62  # stands for an infinite duration
 
 Controller = Callable[[float, Rotation, Floats], Floats]
@@ -80,7 +81,7 @@ class Simulation:
         )
         # Memory for all steps, or for twice the history, so that old states are dropped in blocks.
         rows = min(self.last_step, 2 * self.history_steps) + 1
-        self.states = np.empty((rows, mujoco.mj_stateSize(self.model, int(STATE))))
+        self.states = np.empty((rows, mujoco.mj_stateSize(self.model, STATE)))
         self.step = self.first_step = 0
         self.data = mujoco.MjData(self.model)
         self.rollout = Rollout(nthread=0)
@@ -89,7 +90,7 @@ class Simulation:
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
         data.qvel[:3] = rate_body_rad_s
         set_start(vehicle.config, self.model, data)
-        mujoco.mj_getState(self.model, data, self.states[0], int(STATE))
+        mujoco.mj_getState(self.model, data, self.states[0], STATE)
         # The forward dynamics give the warm start of the first step.
         mujoco.mj_forward(self.model, data)
 
@@ -166,7 +167,7 @@ class Simulation:
                 [self.data],
                 self.states[None, row],
                 control[None],
-                control_spec=int(CONTROL),
+                control_spec=CONTROL,
                 skip_checks=True,
                 nstep=len(control),
                 initial_warmstart=self.data.qacc_warmstart[None].copy(),
@@ -213,9 +214,7 @@ class Simulation:
     def trajectory(self, begin: int = 0) -> Trajectory:
         """The motion from step begin on, as a Trajectory."""
         t_s, lab_from_body_wxyz, rate = self.knots(begin)
-        return Trajectory(
-            t_s, Rotation.from_quat(lab_from_body_wxyz, scalar_first=True), rate.copy()
-        )
+        return Trajectory(t_s, to_rotation(lab_from_body_wxyz), rate.copy())
 
 
 class PrescribedMotion(Simulation):
@@ -236,9 +235,7 @@ class PrescribedMotion(Simulation):
     ) -> None:
         self.state_at = state_at
         wxyz, rate = state_at(0.0)
-        super().__init__(
-            vehicle, Rotation.from_quat(wxyz, scalar_first=True), rate, duration_s, history_s
-        )
+        super().__init__(vehicle, to_rotation(wxyz), rate, duration_s, history_s)
 
     def advance(self, control: Floats) -> None:
         """Advance one step for each row of control (K, nu); its values have no effect."""
@@ -290,7 +287,7 @@ def simulate(
     while simulation.steps_left:
         control = np.zeros((min(steps, simulation.steps_left), vehicle.model.nu))
         if controller:
-            attitude = Rotation.from_quat(simulation.lab_from_body_wxyz, scalar_first=True)
+            attitude = to_rotation(simulation.lab_from_body_wxyz)
             torque = controller(simulation.now_s, attitude, simulation.rate_body_rad_s.copy())
             control[:, vehicle.torques] = np.clip(torque, -limit, limit)
         simulation.advance(control)

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
+from skysim.core.quaternion import to_rotation
 from skysim.core.types import Floats, frozen
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
@@ -169,7 +170,7 @@ def unbalance(model: Any, wheel_joints: list[Any], wheels: WheelsConfig, path: P
         center_m = own.ipos + wheels.static_imbalance_kg_m / own.mass[0] * across
         # 3. Inertia.
         product = np.outer(axle, np.cross(axle, across))
-        axes = Rotation.from_quat(own.iquat, scalar_first=True).as_matrix()
+        axes = to_rotation(own.iquat).as_matrix()
         balanced = axes @ np.diag(own.inertia) @ axes.T
         inertia = balanced + wheels.dynamic_imbalance_kg_m2 * (product + product.T)
         subject = ("vehicle.wheels.dynamic_imbalance", f"with it {joint.name}'s ({path})")
@@ -324,7 +325,7 @@ SERVO_S = 5e-3  # time constant of the servo; five steps of the integration
 
 def gravity_body_m_s2(model: Any, angles_rad: Floats) -> Floats:
     """(3,) the model's gravity in body axes, at a full qpos."""
-    lab_from_body = Rotation.from_quat(angles_rad[:4], scalar_first=True)
+    lab_from_body = to_rotation(angles_rad[:4])
     return lab_from_body.inv().apply(model.opt.gravity)
 
 

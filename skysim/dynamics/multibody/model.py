@@ -29,6 +29,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
+from skysim.core.quaternion import to_rotation
 from skysim.core.types import Floats, Ints, Mount, frozen
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorDrive,
@@ -380,7 +381,7 @@ def place_camera(spec: Any, vehicle: VehicleConfig) -> None:
         wxyz = spec.compile().camera(CAMERA).quat
         file_from_turned = Rotation.from_rotvec(vehicle.camera_rotation_deg, degrees=True)
         mjcam_from_turned = CAM_FROM_MJCAM.inv() * file_from_turned * CAM_FROM_MJCAM
-        parent_from_turned = Rotation.from_quat(wxyz, scalar_first=True) * mjcam_from_turned
+        parent_from_turned = to_rotation(wxyz) * mjcam_from_turned
         camera.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
         camera.quat = parent_from_turned.as_quat(scalar_first=True)
     if vehicle.camera_m is None:

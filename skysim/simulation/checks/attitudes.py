@@ -11,6 +11,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from skysim.core.constants import GOLDEN_ANGLE_RAD
+from skysim.core.quaternion import to_rotation
 from skysim.core.types import UP, Floats, lengths
 from skysim.dynamics import multibody
 from skysim.simulation.lab import Lab
@@ -99,7 +100,7 @@ def of_frames(lab: Lab) -> CheckedAttitudes:
         reference = lab.reference
         states = [reference.state_at(float(t)) for t in t_s]
         wxyz, rates, _ = (np.array(column) for column in zip(*states, strict=True))
-        lab_from_body = Rotation.from_quat(wxyz, scalar_first=True)
+        lab_from_body = to_rotation(wxyz)
     every = CheckedAttitudes(lab, lab_from_body, rates + jitter, t_s)
     # 2. Evenly spaced frames, the fastest and the most tilted.
     chosen = set(np.linspace(0, len(index) - 1, min(len(index), FRAMES)).astype(int))

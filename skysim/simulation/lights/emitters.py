@@ -254,6 +254,8 @@ class BackgroundLight(AddedLight):
     glows: tuple[Glow, ...]
 
     def during(self, exposure: Exposure) -> Lit:
+        if not self.glows:
+            return Lit(BACKGROUND)
         return Lit(BACKGROUND, glow=lambda: glow_map(self.glows, exposure.camera))
 
 

@@ -154,12 +154,27 @@ def test_any_nonzero_light_has_a_center_of_gravity(light: float) -> None:
     sky = np.zeros((3, 3))
     image[4, 3:5] = light * np.array([0.25, 0.75])
     boxes = np.array([[3, 4, 4, 4]])
-    x, y, sigma, flux = moments.center_of_gravity(image, boxes, sky, sky + 1.0, 1.0)[0]
+    first = np.array([0])
+    x, y, sigma, flux = moments.center_of_gravity(image, boxes, first, sky, sky + 1.0, 1.0)[0]
     assert (x, y, flux) == (3.75, 4.0, light)
     assert sigma > 0
-    x, y, sigma, flux = moments.center_of_gravity(0 * image, boxes, sky, sky + 1.0, 1.0)[0]
+    x, y, sigma, flux = moments.center_of_gravity(
+        0 * image, boxes, first, sky, sky + 1.0, 1.0
+    )[0]
     assert np.isnan([x, y, sigma]).all()
     assert flux == 0
+
+
+def test_chosen_boxes_have_the_centers_of_gravity_that_they_have_among_all() -> None:
+    """Also where a box that is not chosen takes pixels of one that is."""
+    image = 10 + gaussian((40, 40), 15.2, 20.1, 1e4) + gaussian((40, 40), 21.3, 20.4, 1e4)
+    boxes = np.array([[13, 18, 17, 22], [19, 18, 23, 22], [2, 2, 5, 5]])
+    sky = np.full((1, 1), 10.0)
+    every, second = (
+        moments.center_of_gravity(image, boxes, np.array(rows), sky, sky, 1.0)
+        for rows in ([0, 1, 2], [1])
+    )
+    np.testing.assert_array_equal(second, every[1:2])
 
 
 @pytest.mark.parametrize("sigma", [0.3, 0.4, 0.5])

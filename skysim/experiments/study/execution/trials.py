@@ -452,7 +452,7 @@ def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
             drawn = [quaternion.multiply(lab_from_pole, each) for each in drawn]
         cam_from_body = quaternion.from_rotation(lab.camera.mount.cam_from_body)
         drawn = [quaternion.multiply(each, cam_from_body) for each in drawn]
-    return Rotation.from_quat(drawn, scalar_first=True)
+    return quaternion.to_rotation(np.array(drawn))
 
 
 def lab_from_body_pole(name: str, scene: Scene) -> Floats:
