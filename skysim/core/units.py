@@ -151,6 +151,16 @@ def in_si(value: str, si_unit: str | None = None) -> float:
             raise InputError("", error) from None
 
 
+def within(least: float, most: float) -> Any:
+    """The bounds of a number that may be equal to either."""
+    return Field(ge=least, le=most)
+
+
+def above(limit: float, most: float) -> Any:
+    """The bounds of a number that is greater than the first and may be equal to the second."""
+    return Field(gt=limit, le=most)
+
+
 # Of any type: a value above zero, and one of zero or more; lists of one or more, two or more, three.
 Item = TypeVar("Item")
 AboveZero = Annotated[Item, Field(gt=0)]
@@ -183,25 +193,25 @@ PositiveLength = AboveZero[Length]
 Position = Three[Length]
 Duration = AboveZero[Time]
 Delay = ZeroOrMore[Time]
-TimeLimit = Annotated[Time, Field(ge=1e-3, le=3600)]
+TimeLimit = Annotated[Time, within(1e-3, 3600)]
 # An angle or a rate.
-Spin = Annotated[Number, Field(ge=-360, le=360)]
+Spin = Annotated[Number, within(-360, 360)]
 Spins = Three[Spin]
 RightAscension = Annotated[Number, Field(ge=0, lt=360)]
-Declination = Annotated[Number, Field(ge=-90, le=90)]
-AxisAngle = Annotated[Number, Field(ge=0, le=180)]
-Magnitude = Annotated[Number, Field(ge=-30, le=30)]
-Temperature = Annotated[Number, Field(ge=-150, le=150)]
-Seed = Annotated[int, Field(ge=0, le=1e18)]
-Whole = Annotated[int, Field(ge=0, le=1_000_000_000)]
+Declination = Annotated[Number, within(-90, 90)]
+AxisAngle = Annotated[Number, within(0, 180)]
+Magnitude = Annotated[Number, within(-30, 30)]
+Temperature = Annotated[Number, within(-150, 150)]
+Seed = Annotated[int, within(0, 1e18)]
+Whole = Annotated[int, within(0, 1_000_000_000)]
 PositiveInt = Annotated[Whole, Field(ge=1)]
-Fraction = Annotated[Number, Field(ge=0, le=1)]
-PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
+Fraction = Annotated[Number, within(0, 1)]
+PositiveFraction = Annotated[Number, above(0, 1)]
 InnerFraction = Annotated[Number, Field(gt=0, lt=1)]
-WITHIN_BILLION = Field(ge=-1e9, le=1e9)
+WITHIN_BILLION = within(-1e9, 1e9)
 # Of any unit: all parts (ppm), most of a turn in arcseconds, a clock of a THz in MHz.
-Positive = Annotated[Number, Field(gt=0, le=1e6)]
-NotNegative = Annotated[Number, Field(ge=0, le=1e6)]
+Positive = Annotated[Number, above(0, 1e6)]
+NotNegative = Annotated[Number, within(0, 1e6)]
 Signed = Annotated[Number, WITHIN_BILLION]
 Fractions = Several[Fraction]
 # Options of a program of the user, which knows their meaning.

@@ -28,6 +28,7 @@ from skysim.core.units import (
     Spins,
     Time,
     TimeError,
+    within,
 )
 from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
 from skysim.scene.sections.camera import CameraConfig
@@ -65,7 +66,7 @@ class ExposureConfig(ConfigModel):
     frames: PositiveInt
     first_s: Delay = 0.0
     trigger_jitter_s: Delay = 0.0
-    time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
+    time_tag_offset_s: Annotated[Time, within(-1, 1)] = 0.0
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
     def check(self) -> None:

@@ -37,6 +37,7 @@ from skysim.core.units import (
     Seed,
     Signed,
     Three,
+    within,
 )
 from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
 from skysim.experiments.study.factors import (
@@ -55,7 +56,7 @@ from skysim.scene.scene import Requirements, Scene
 TRIAL = "trial."
 HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`trials.seed_of`)
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
-Tilt = Annotated[Number, Field(ge=0, le=90)]
+Tilt = Annotated[Number, within(0, 90)]
 BodyName = Literal[
     "zenith",
     "sun",
@@ -183,8 +184,8 @@ class CentroidTrial(RandomAttitude):
     magnitude_sigma: NotNegative = 0.25
     lights: PositiveInt | None = None
     missing: Fraction = 0.0
-    false_lights: Annotated[int, Field(ge=0, le=10_000)] = 0
-    false_share: Annotated[Number, Field(ge=0, le=0.95)] = 0.0
+    false_lights: Annotated[int, within(0, 10_000)] = 0
+    false_share: Annotated[Number, within(0, 0.95)] = 0.0
 
 
 class FrameTrial(RandomAttitude):
@@ -216,7 +217,7 @@ class FrameTrial(RandomAttitude):
     turn_deg: Signed = 0.0
     rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
-    tracked: Annotated[int, Field(ge=0, le=100)] = 0
+    tracked: Annotated[int, within(0, 100)] = 0
 
 
 def expand_start(value: Any) -> Any:
@@ -391,7 +392,7 @@ class Search(ConfigModel):
 
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1, max_length=2)]
     constraints: tuple[Constraint, ...] = ()
-    candidates: Annotated[int, Field(ge=2, le=100_000)] = 60
+    candidates: Annotated[int, within(2, 100_000)] = 60
     cost: Cost = Cost()
 
     @property
@@ -435,7 +436,7 @@ class Study(ConfigModel):
         default_factory=dict, max_length=100
     )
     design: Design = Design()
-    replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
+    replicates: Annotated[int, within(1, 10_000_000)] = 1
     hardware: tuple[SeedKey, ...] = ()
     paired: bool = True
     responses: NotEmpty[str]

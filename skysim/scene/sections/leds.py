@@ -33,12 +33,14 @@ from skysim.core.units import (
     TableConfig,
     Time,
     Tolerance,
+    above,
     with_unit,
+    within,
 )
 
 Distance = Literal[3, 5, 7, 11]
 ClockError = Annotated[NumberError, Field(le=10_000)]
-Offset = Annotated[Length, Field(ge=-0.01, le=0.01)]
+Offset = Annotated[Length, within(-0.01, 0.01)]
 
 
 class CosineLobeConfig(ConfigModel):
@@ -246,7 +248,7 @@ class AgingConfig(ConfigModel):
     """
 
     hours: Positive
-    life_hours: Annotated[Number, Field(gt=0, le=1e7)]
+    life_hours: Annotated[Number, above(0, 1e7)]
     scatter: Annotated[NumberError, Field(lt=1), below_one("makes light")] = 0.0
 
 
@@ -290,7 +292,7 @@ Wavelength = Annotated[
     Number,
     Positive,
     with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'),
-    Field(ge=300e-9, le=1100e-9),
+    within(300e-9, 1100e-9),
 ]
 LedSpectrum = Annotated[
     Annotated[
@@ -322,7 +324,7 @@ class LedLightConfig(ConfigModel):
     intensity_cd: AboveZero[Intensity] | None = None
     radiant_intensity_w_sr: AboveZero[RadiantIntensity] | None = None
     spectrum: LedSpectrum = "white"
-    fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
+    fwhm_m: Annotated[Length, within(3e-9, 200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
 
     def check(self) -> None:
@@ -368,7 +370,7 @@ class LedConfig(LedLightConfig):
         left out
     """
 
-    disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
+    disk_diameter_m: Annotated[Length, above(0, 0.1)]
     die_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
