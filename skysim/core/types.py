@@ -17,6 +17,7 @@ Ints = NDArray[np.int64]
 Record = dict[str, Any]  # values by name, as an object in JSON or a row of a table
 Bools = NDArray[np.bool_]
 Singles = NDArray[np.float32]
+Array = NDArray  # of numbers of any type
 
 
 def lengths(vectors: Floats) -> Floats:

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -25,6 +24,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.types import (
     ATTITUDES,
+    Array,
     Floats,
     Frame,
     Ints,
@@ -107,7 +107,7 @@ class LabelledFrame(NamedTuple):
 
     frame: Frame
     truth: Truth
-    sources: NDArray
+    sources: Array
     extents: Extents
     unmatched_px: Floats
     masks: dict[str, list[int]]
@@ -173,7 +173,7 @@ def label_frame(
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
 
 
-def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray, Floats]:
+def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[Array, Floats]:
     """(N,) labels of the sources, brightest first, and the (M, 2) detections that belong to no source.
 
     A detection belongs to the brightest free source whose distance is at most SAME_LIGHT_PX plus half the length of
@@ -209,7 +209,7 @@ def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Int
     return chosen
 
 
-def image_extents(rows: NDArray, window: Window, height_px: int) -> Extents:
+def image_extents(rows: Array, window: Window, height_px: int) -> Extents:
     """The rectangle about each source's streak.
 
     On each side it is wider than the streak by REACH_SIGMA standard deviations of the blur, or by the radius of a disc
@@ -248,7 +248,7 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
     return np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi))
 
 
-def run_lengths(mask: NDArray, least: float = True) -> list[int]:
+def run_lengths(mask: Array, least: float = True) -> list[int]:
     """Lengths of the runs of an (H, W) mask, column by column, beginning with pixels that are not set: COCO's code.
 
     Parameters
@@ -565,7 +565,7 @@ def index_table(rows: list[Record]) -> bytes:
     return parquet({name: [row[name] for row in rows] for name in rows[0]})
 
 
-def sources_table(frames: list[int], sources: list[NDArray]) -> bytes:
+def sources_table(frames: list[int], sources: list[Array]) -> bytes:
     """The sources of a shard: a row for each source of each frame."""
     rows = np.concatenate(sources)
     number = np.repeat(frames, [len(one) for one in sources])

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -42,7 +41,7 @@ from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder
-from skysim.core.types import UP, Floats, Ints, Record, lengths, normalized
+from skysim.core.types import UP, Array, Floats, Ints, Record, lengths, normalized
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
 from skysim.experiments.dome_survey.survey_procedure import (
     ATTITUDES,
@@ -124,7 +123,7 @@ class HeldFrame(NamedTuple):
     magnitude: Floats
 
 
-def measure(image_dn: NDArray[Any], scene: Scene) -> tuple[Floats, Floats]:
+def measure(image_dn: Array, scene: Scene) -> tuple[Floats, Floats]:
     """(N, 2) centroids and (N,) magnitudes of the lights of an image (Padro 2012, sections 3.4.1.3 and 3.6.2.1).
 
     As the thesis does with MATLAB's `bwlabel` and `regionprops`, by their counterparts in scikit-image: regions of at
@@ -205,9 +204,7 @@ def apart_deg(a: Rotation, b: Rotation) -> float:
     return float(np.degrees((a.inv() * b).magnitude()))
 
 
-def name_lights(
-    known: CalibrationPrior, frame: HeldFrame
-) -> tuple[NDArray[Any], NDArray[Any]]:
+def name_lights(known: CalibrationPrior, frame: HeldFrame) -> tuple[Array, Array]:
     """Rows of the map and of the frame's lights that are each other's nearest, within half the least spacing.
 
     An error of the IMU moves all images alike, so a frame with all its LEDs is first moved onto the expected ones.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.constants import SIGMA_PER_MAD
-from skysim.core.types import Floats, SourceTruth
+from skysim.core.types import Floats, Record, SourceTruth
 from skysim.sources.satellites import light_name
 
 Picture = NDArray[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
@@ -107,7 +107,7 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
 # Convert frames to 8-bit images for display, and encode them as JPEG.
 
 
-CURVES: dict[str, Any] = {
+CURVES: Record = {
     "square root": np.sqrt,
     "linear": lambda fraction: fraction,
     "logarithm": lambda fraction: np.log1p(200 * fraction) / np.log1p(200),

@@ -3,10 +3,9 @@
 import datetime
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import cKDTree
 
@@ -20,7 +19,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, joined, taken
+from skysim.core.types import Array, Floats, joined, taken
 from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -346,7 +345,7 @@ def read_frame(
 
 
 def measurable(
-    numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float
+    numbers: Array, centroids: Centroids, transfer: Transfer, saturation_dn: float
 ) -> Floats:
     """(N, 2) pixels of stars that are bright, not saturated, and away from the border and from other stars."""
     xy = centroids.xy_px

@@ -26,12 +26,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Bools, Floats, Ints, Singles
+from skysim.core.types import Array, Bools, Floats, Ints, Singles
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -119,7 +118,7 @@ def median_and_spread(values: Floats) -> tuple[float, float]:
     return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
 
 
-def blocks(image: NDArray, side: int) -> NDArray:
+def blocks(image: Array, side: int) -> Array:
     """(rows, side, columns, side) square blocks of an image; incomplete ones at the right and below are cut off."""
     rows, columns = (size // side for size in image.shape)
     return image[: rows * side, : columns * side].reshape(rows, side, columns, side)
@@ -180,11 +179,11 @@ class Level:
     medians: list[tuple[float, Path]] = field(default_factory=list)
     pairs: int = 0
     greatest_dn: int = 0
-    first: NDArray | None = None
+    first: Array | None = None
     sums: Any = 0
     square_dn2: float = 0.0
 
-    def add(self, frame: NDArray) -> None:
+    def add(self, frame: Array) -> None:
         """Add a frame of digital numbers; every second one completes a pair, and an odd last one is left out."""
         if self.first is None:
             self.first = frame

@@ -428,7 +428,7 @@ class Study(ConfigModel):
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
-    scene: str | dict[str, Any]
+    scene: str | Tree
     seed: Seed
     set: Settings = Field(default_factory=dict)
     trial: Trial
@@ -497,7 +497,7 @@ class TrialSpec:
         Digests of these functions and objects
     """
 
-    scene: str | dict[str, Any]
+    scene: str | Tree
     folder: str
     seed: int
     base: Settings

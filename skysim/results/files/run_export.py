@@ -11,14 +11,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, check_name
 from skysim.core.time import in_utc
-from skysim.core.types import ATTITUDES, Record
+from skysim.core.types import ATTITUDES, Array, Record
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
@@ -194,7 +193,7 @@ COMPONENTS = {
 }
 
 
-def frame_columns(run: Recording, bar: Bar) -> dict[str, NDArray[Any]]:
+def frame_columns(run: Recording, bar: Bar) -> dict[str, Array]:
     """The truth of all frames by the fields of FrameTruth, (F,) or (F, K) each; times as text."""
     true = [truth._replace(sources=None) for truth in truths(run, bar)]
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in true]

@@ -25,12 +25,12 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, remove, room_left
-from skysim.core.types import Bools, Record
+from skysim.core.types import Array, Bools, Record
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
 from skysim.results.files import row_parts
-from skysim.results.files.row_parts import Array, Part, Rows
+from skysim.results.files.row_parts import Part, Rows
 
 STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 10  # raised when the columns of `trials` or `timings` change

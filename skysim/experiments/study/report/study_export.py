@@ -10,9 +10,10 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, check_name
+from skysim.core.types import Array
 from skysim.experiments.study.execution.store import COLUMNS, Store
 from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
-from skysim.results.files.row_parts import EXTRA, Array, encoding, to_arrow
+from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 Names = tuple[str, ...]
 META = ("title", "code", "study")  # what the files say of the study
