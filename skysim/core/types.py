@@ -62,6 +62,11 @@ def positive(values: Floats) -> Floats:
     return np.where(values > 0, values, np.nan)
 
 
+def median(values: Any) -> float:
+    """The median of numbers, as a number of Python."""
+    return float(np.median(values))
+
+
 Kind = TypeVar("Kind")
 
 

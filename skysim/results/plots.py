@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from skysim.core.constants import SIGMA_PER_MAD
-from skysim.core.types import Floats, Record, SourceTruth
+from skysim.core.types import Floats, Record, SourceTruth, median
 from skysim.sources.satellites import light_name
 
 Picture = NDArray[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
@@ -163,11 +163,9 @@ def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
     deviation are integers and the deviation can be 0.
     """
     sample = image[:: 2 * SAMPLE_STRIDE, ::SAMPLE_STRIDE].astype(float)
-    sky = float(np.median(sample))
+    sky = median(sample)
     deviation = np.abs(sample - sky)
-    background = sample[
-        deviation <= max(5 * SIGMA_PER_MAD * float(np.median(deviation)), 3.0)
-    ]
+    background = sample[deviation <= max(5 * SIGMA_PER_MAD * median(deviation), 3.0)]
     peak = float(image.max())
     saturated = int(np.count_nonzero(image >= saturation_dn)) if peak >= saturation_dn else 0
     return FrameStatistics(sky, float(background.std()), peak, saturated)

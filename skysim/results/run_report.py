@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from estimator.identification import refusals as reasons
-from skysim.core.types import Record
+from skysim.core.types import Record, median
 from skysim.results import metrics, scoring
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import (
@@ -159,7 +159,7 @@ def summary(rows: Rows) -> Record:
         **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in solved]),
         "scatter_arcsec": scatter_arcsec(solved),
         **claims(solved),
-        "time_ms_median": float(np.median([row.time_ms for row in rows])),
+        "time_ms_median": median([row.time_ms for row in rows]),
         **magnitude_errors(rows),
     }
 

@@ -19,7 +19,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
-from skysim.core.types import Array, Floats, joined, taken
+from skysim.core.types import Array, Floats, joined, median, taken
 from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -212,7 +212,7 @@ def image_size(
         pull = (stars.variance_px2 - expected) / (relative * expected)
         again = sound & (
             np.abs(pull)
-            < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / MAD_PER_SIGMA)
+            < OUTLIER_SIGMAS * max(1.0, median(np.abs(pull[kept])) / MAD_PER_SIGMA)
         )
         is_settled = np.array_equal(again, kept) and np.allclose(
             error, relative * expected, rtol=SETTLED
@@ -353,7 +353,7 @@ def measurable(
     inside = np.all((xy >= HALF_PX) & (xy <= last - HALF_PX), axis=1)
     near = cKDTree(xy).query(xy, k=2)[0][:, 1]
     x, y = np.clip(np.rint(xy).astype(int), 0, last).T
-    background = float(np.median(numbers))
+    background = median(numbers)
     gain, _, read, black = transfer.values[: BLACK + 1]
     dark_e2 = (background - black) / gain + read / gain**2
     flux_e = centroids.flux / gain
@@ -385,7 +385,7 @@ def check_trails(frames: list[NightFrame]) -> None:
             continue
         along, across = np.median(one.stars.stretch_px2, axis=0).tolist()
         stretch = math.hypot(along, across)
-        variance = float(np.median(one.stars.variance_px2))
+        variance = median(one.stars.variance_px2)
         if stretch > MAX_STRETCH * variance:
             # A uniform streak of length L has the variance L^2 / 12.
             trail_px = math.sqrt(12 * stretch)

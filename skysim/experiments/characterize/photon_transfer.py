@@ -30,7 +30,7 @@ from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Array, Bools, Floats, Ints, Singles
+from skysim.core.types import Array, Bools, Floats, Ints, Singles, median
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -114,8 +114,8 @@ def propagate(
 
 def median_and_spread(values: Floats) -> tuple[float, float]:
     """Median and robust standard deviation."""
-    median = float(np.median(values))
-    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
+    middle = median(values)
+    return middle, median(np.abs(values - middle)) / MAD_PER_SIGMA
 
 
 def blocks(image: Array, side: int) -> Array:

@@ -17,7 +17,7 @@ from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
 from skysim.core.errors import InputError, check_name
 from skysim.core.time import in_utc
-from skysim.core.types import ATTITUDES, Array, Record
+from skysim.core.types import ATTITUDES, Array, Record, median
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
@@ -370,7 +370,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> Paths:
     path = out / "frames.mp4"
     first = run.image(run.stems[0])
     seconds = [truth.t_mid_s for truth in truths(run, bar)]
-    rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    rate_hz = 1 / median(np.diff(seconds)) if len(seconds) > 1 else 1.0
     sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
     low, high = np.median([plots.display_levels(run.image(stem)) for stem in sampled], axis=0)
     height, width = (

@@ -15,7 +15,17 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
-from skysim.core.types import UP, Array, Floats, Ints, Record, Telemetry, Truth, frozen
+from skysim.core.types import (
+    UP,
+    Array,
+    Floats,
+    Ints,
+    Record,
+    Telemetry,
+    Truth,
+    frozen,
+    median,
+)
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg, saturated_s
 from skysim.simulation.lab import Lab
@@ -206,7 +216,7 @@ def score(
     cam_from_lab = quaternion.multiply(cam_from_body, quaternion.inverse(lab_from_body))
     streak_px = nan
     if lights.streak_px is not None and len(lights.streak_px):
-        streak_px = float(np.median(lights.streak_px))
+        streak_px = median(lights.streak_px)
     reach_px = SAME_LIGHT_PX + (0.0 if math.isnan(streak_px) else streak_px / 2)
     own_tracker = isinstance(estimator, StarTracker | DomeTracker)
     errors_px = distances_px(centroids_px, lights.flux_xy_px, reach_px)
