@@ -284,13 +284,15 @@ def to_json(data: Any) -> str:
     """JSON text of data, with null for NaN and infinity."""
 
     def without_nan(value: Any) -> Any:
-        """The value with NumPy's numbers as Python's, and None for NaN and infinity."""
+        """The value with NumPy's arrays and numbers as Python's, paths as text, and None for NaN and infinity."""
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
         if isinstance(value, dict):
             return {key: without_nan(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return [without_nan(item) for item in value]
-        if isinstance(value, np.generic):
-            value = value.item()
+        if isinstance(value, Path):
+            return str(value)
         return None if isinstance(value, float) and not np.isfinite(value) else value
 
     return json.dumps(without_nan(data), indent=1, allow_nan=False)

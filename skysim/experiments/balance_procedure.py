@@ -282,7 +282,7 @@ def flight_row(number: int, one: Iteration) -> Record:
     per_um = 1e6 / mass.mass_kg
     return {
         "flight": number,
-        "duration_s": float(one.flight.record.t_s[-1]),
+        "duration_s": one.flight.record.t_s[-1],
         "frames": one.flight.frames,
         "solved": one.flight.solved,
         "after_contact": one.flight.after_contact,

@@ -337,9 +337,7 @@ def statistics(found: Calibration) -> Record:
     return {
         "frames": len(found.stop),
         "focal_px": found.camera.focal_px,
-        "leds": [
-            {"led": int(found.led[n])} | spread(found, found.magnitude[:, n]) for n in order
-        ],
+        "leds": [{"led": found.led[n]} | spread(found, found.magnitude[:, n]) for n in order],
         "ranks": [spread(found, column) for column in ranked.T],
         "pairs": [spread(found, column) for column in ascending.T],
         "distinct": len(groups) + 1,
@@ -352,34 +350,33 @@ def statistics(found: Calibration) -> Record:
             "position_mm": 1e3 * found.catalog.epsilon_pos_m,
             "separation_arcsec": found.catalog.epsilon_sep_rad / ARCSEC_RAD,
         },
-        "height_range_mm": float(np.ptp(columns_mm[:, :, 2])),
+        "height_range_mm": np.ptp(columns_mm[:, :, 2]),
         "difference_deg": differences(difference_deg),
         "stops": [
             {
                 "frames": len(one),
-                "imu_deg": found.imu_deg[n].tolist(),
-                "algorithm_deg": found.algorithm_deg[n].tolist(),
-                "difference_deg": difference_deg[n].tolist(),
-                "x_mm": one[:, :, 0].mean(axis=0).tolist(),
+                "imu_deg": found.imu_deg[n],
+                "algorithm_deg": found.algorithm_deg[n],
+                "difference_deg": difference_deg[n],
+                "x_mm": one[:, :, 0].mean(axis=0),
             }
             for n, one in enumerate(by_stop(found, columns_mm))
         ],
     }
 
 
-def differences(difference_deg: Floats) -> dict[str, list[float]]:
+def differences(difference_deg: Floats) -> dict[str, Floats]:
     """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1).
 
     A single stop has no deviation, NaN.
     """
     absolute = np.abs(difference_deg)
-    columns = {
+    return {
         "least": absolute.min(axis=0),
         "largest": absolute.max(axis=0),
         "mean": absolute.mean(axis=0),
         "sd": deviation(absolute),
     }
-    return {name: one.tolist() for name, one in columns.items()}
 
 
 def spread(found: Calibration, values: Floats) -> Record:
@@ -389,7 +386,7 @@ def spread(found: Calibration, values: Floats) -> Record:
 
 def moments(values: Floats) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values; NaN for the deviation of one."""
-    return {"mean": float(values.mean()), "sd": float(deviation(values))}
+    return {"mean": values.mean(), "sd": deviation(values)}
 
 
 def deviation(values: Floats) -> Any:

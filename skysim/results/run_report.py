@@ -175,8 +175,8 @@ def claims(solved: Rows) -> dict[str, float]:
     }
     shares = np.nan_to_num([row.survey_share for row in known])
     return sizes | {
-        "nees_mean": float(np.mean([row.nees for row in known])),
-        "survey_share": float(np.mean(shares)),
+        "nees_mean": np.mean([row.nees for row in known]),
+        "survey_share": np.mean(shares),
     }
 
 
@@ -208,9 +208,9 @@ def magnitude_errors(rows: Rows) -> Record:
     mean = np.average(means, weights=stars)
     squares = np.sum((stars - 1) * sigmas**2 + stars * (means - mean) ** 2)
     return {
-        "magnitude_error_mag_mean": float(mean),
-        "magnitude_error_mag_sigma": float(np.sqrt(squares / (stars.sum() - 1))),
-        "magnitude_stars": int(stars.sum()),
+        "magnitude_error_mag_mean": mean,
+        "magnitude_error_mag_sigma": np.sqrt(squares / (stars.sum() - 1)),
+        "magnitude_stars": stars.sum(),
     }
 
 

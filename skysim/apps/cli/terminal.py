@@ -227,7 +227,7 @@ def print_catalog(catalog: Record, json: bool) -> None:
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
     listed = [
-        {"name": path.stem, "title": title_of(path), "file": str(path)}
+        {"name": path.stem, "title": title_of(path), "file": path}
         for path in shipped_files(folder).values()
     ]
     print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")
