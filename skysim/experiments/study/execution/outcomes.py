@@ -24,6 +24,7 @@ from skysim.core.types import (
     Telemetry,
     Truth,
     frozen,
+    lengths,
     median,
 )
 from skysim.results import metrics
@@ -313,7 +314,7 @@ def count_wrong_matches(
     nearest, _ = nearest_light(claimed_px, lights.xy_px)
     expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
     # NaN counts as wrong.
-    return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))
+    return int(np.sum(~(lengths(observed_px - expected_px) <= reach_px)))
 
 
 def distances_px(xy_px: Floats, others_px: Floats, reach_px: float) -> Floats:
