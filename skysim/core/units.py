@@ -168,6 +168,7 @@ ZeroOrMore = Annotated[Item, Field(ge=0)]
 NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
 Several = Annotated[tuple[Item, ...], Field(min_length=2)]
 Three = tuple[Item, Item, Item]
+ZEROS = (0.0, 0.0, 0.0)
 # Every number has a least and a greatest value. Those of quantities are beyond any laboratory that could be built: a
 # hall of 10 km, a vehicle of 1000 t, a run of a century. A section narrows them where it knows better.
 Number = Annotated[float, Field(allow_inf_nan=False)]

@@ -19,6 +19,7 @@ from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import Moment
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     ConfigModel,
     Delay,
     Position,
@@ -114,8 +115,8 @@ class HeadConfig(ConfigModel):
     name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
     position_m: Position
     rotation_deg: Spins
-    mount_error_arcsec: Coefficients = (0.0, 0.0, 0.0)
-    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
+    mount_error_arcsec: Coefficients = ZEROS
+    mount_arcsec_k: Coefficients = ZEROS
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
     exposure: ExposureConfig | None = None

@@ -14,6 +14,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     AboveZero,
     AxisAngle,
     ConfigModel,
@@ -31,6 +32,7 @@ from skysim.core.units import (
     RadiantIntensity,
     Several,
     TableConfig,
+    Three,
     Time,
     Tolerance,
     above,
@@ -371,7 +373,7 @@ class LedConfig(LedLightConfig):
     """
 
     disk_diameter_m: Annotated[Length, above(0, 0.1)]
-    die_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
+    die_m: Three[Offset] = ZEROS
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     types: dict[str, LedTypeConfig] = Field(default_factory=dict)

@@ -23,6 +23,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     ConfigModel,
     Declination,
     Distance,
@@ -76,7 +77,7 @@ class SurfaceConfig(ConfigModel):
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
-    offset_m: Position = (0.0, 0.0, 0.0)
+    offset_m: Position = ZEROS
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
 

@@ -12,6 +12,7 @@ from pydantic import (
 from skysim.core.errors import InputError
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     AboveZero,
     ConfigModel,
     Declination,
@@ -385,7 +386,7 @@ class MotionConfig(ConfigModel):
     """
 
     start: Start = AttitudeConfig()
-    rate_deg_s: StartRate = (0.0, 0.0, 0.0)
+    rate_deg_s: StartRate = ZEROS
     control: Annotated[
         ControlConfig | None,
         BeforeValidator(

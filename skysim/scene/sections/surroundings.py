@@ -9,6 +9,7 @@ from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     AxisAngle,
     ConfigModel,
     Declination,
@@ -185,8 +186,8 @@ class ThermalConfig(ConfigModel):
     speed: Annotated[Number, within(1, 1e5)] = 1.0
     dome_ppm_k: Coefficient = 0.0
     anchor_height_m: Length = 0.0
-    creep_m: Position = (0.0, 0.0, 0.0)
-    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
+    creep_m: Position = ZEROS
+    mount_arcsec_k: Coefficients = ZEROS
     lens_ppm_k: Coefficient = 0.0
 
     @property

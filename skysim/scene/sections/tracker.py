@@ -6,6 +6,7 @@ from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    ZEROS,
     ConfigModel,
     Delay,
     Duration,
@@ -97,7 +98,7 @@ class SurveyErrorsConfig(ConfigModel):
         Seed of the errors
     """
 
-    rotation_deg: Spins = (0.0, 0.0, 0.0)
+    rotation_deg: Spins = ZEROS
     surface_seed: Seed | None = None
     led_sigma_m: PlaceError = 0.0
     lever_sigma_m: PlaceError = 0.0

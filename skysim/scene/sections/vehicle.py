@@ -6,6 +6,7 @@ from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    ZEROS,
     AboveZero,
     ConfigModel,
     Damping,
@@ -225,7 +226,7 @@ class DisturbancesConfig(ConfigModel):
         Cable and air currents
     """
 
-    turbine_nm: Three[Torque] = (0.0, 0.0, 0.0)
+    turbine_nm: Three[Torque] = ZEROS
     earth_rotation: bool = False
     cable: CableConfig | None = None
     air_current: AirCurrentConfig | None = None
@@ -293,7 +294,7 @@ class ImuConfig(ConfigModel):
     gyro: GyroConfig = GyroConfig()
     accelerometer: AccelerometerConfig = AccelerometerConfig()
     earth_rate: Literal["none", "uncompensated", "compensated"] = "none"
-    home_error_deg: Spins = (0.0, 0.0, 0.0)
+    home_error_deg: Spins = ZEROS
     hardware_seed: Seed = 200
 
 
@@ -357,10 +358,10 @@ class VehicleConfig(ConfigModel):
     inertia_kg_m2: Three[Inertia] | None = None
     center_of_mass_m: Position | None = None
     camera_m: Position | None = None
-    camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
+    camera_rotation_deg: Spins = ZEROS
     sag_arcsec: tuple[Bend, Bend] = (0.0, 0.0)
     mast_m: Annotated[Length, within(-10, 10)] = 0.0
-    runout_m: tuple[Deviation, Deviation, Deviation] = (0.0, 0.0, 0.0)
+    runout_m: Three[Deviation] = ZEROS
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
     wheels: WheelsConfig | None = None
