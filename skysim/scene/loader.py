@@ -20,8 +20,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
-
 from skysim.core import yaml_reader
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.paths import DATA, SCENES, shipped_files
@@ -33,7 +31,7 @@ from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
     check_version,
-    explain,
+    explained,
     is_file,
     read_yaml,
     set_key,
@@ -329,11 +327,9 @@ def validate(layers: list["Layer"], overrides: OverrideTexts) -> Scene:
     """The scene of layers and overrides: steps 2 to 4 of the module's docstring. Raises InputError."""
     tree = with_overrides(merged(layers), overrides)
     files = locations(layers)
-    try:
+    with explained(tree, files, overrides):
         raw = apply_preset(tree, files, overrides)
         scene = Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
-    except ValidationError as error:
-        raise explain(error, tree, files, overrides) from None
     trees = (with_overrides({}, overrides), *(layer.tree for layer in layers))
     scene._inherited = inherited_keys(trees)
     scene._source = RawKeys(tree)
@@ -574,11 +570,9 @@ def load_camera(
     tree = with_overrides(tree, overrides)
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
-    try:
+    with explained(tree, files, overrides):
         raw = camera_tree(path, tree, files, overrides)
         return CameraFileConfig.model_validate(raw).camera
-    except ValidationError as error:
-        raise explain(error, tree, files, overrides) from None
 
 
 def camera_tree(path: Path, tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:

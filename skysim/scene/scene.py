@@ -31,7 +31,7 @@ from skysim.core.units import (
     TimeError,
     within,
 )
-from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
+from skysim.core.yaml_reader import Tree, excerpt, explained, fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
@@ -181,10 +181,8 @@ class SceneKind(ModelMetaclass):
     """The class of `Scene`: a scene from Python's keywords is refused in one line, like one from a file."""
 
     def __call__(cls, /, **keys: Any) -> Any:
-        try:
+        with explained(keys, [], {}):
             return super().__call__(**keys)
-        except ValidationError as error:
-            raise explain(error, keys, [], {}) from None
 
 
 class Scene(ConfigModel, metaclass=SceneKind):

@@ -14,7 +14,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    ValidationError,
     model_validator,
 )
 
@@ -39,7 +38,7 @@ from skysim.core.units import (
     Three,
     within,
 )
-from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
+from skysim.core.yaml_reader import Tree, explained, is_file, one_line, set_key
 from skysim.experiments.study.factors import (
     MAX_LEVELS,
     SAMPLED_DESIGNS,
@@ -603,11 +602,9 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
     for key, value in (spec.base | settings).items():
         if key.startswith(TRIAL):
             set_key(tree, key, one_line(value))
-    try:
+    # Errors without file and line number; the caller adds the factor.
+    with explained(tree, [], {}):
         return TrialSection.model_validate(tree).trial
-    except ValidationError as error:
-        # One line without file and line number; the caller adds the factor.
-        raise explain(error, tree, [(Path(), "")], {}).at(None) from None
 
 
 class TrialSection(ConfigModel):

@@ -5,7 +5,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
 
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
@@ -16,7 +15,7 @@ from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
     check_version,
-    explain,
+    explained,
     find_file,
     read_yaml,
     set_key,
@@ -117,10 +116,8 @@ def plan_of(
     InputError
         With one line.
     """
-    try:
+    with explained(tree, [(path, text)], overrides or {}):
         study = Study.model_validate(tree)
-    except ValidationError as error:
-        raise explain(error, tree, [(path, text)], overrides or {}) from None
     try:
         plan = make_plan(base or path, study, tree["trial"], programs or {}, text)
         check(plan, to_run=programs is not None)
