@@ -28,7 +28,7 @@ import numpy as np
 from skysim.core import encoded
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_pixels, silent_stderr
-from skysim.core.errors import InputError, reason
+from skysim.core.errors import InputError, reason, refusing
 from skysim.core.files import strict_warnings
 from skysim.core.guarded import run_guarded
 from skysim.core.text import LARGEST
@@ -138,17 +138,15 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
 def unpack(path: Path, file: IO[bytes]) -> None:
     """Unpack a gzipped file, up to MAX_BYTES. Raises InputError for more, and for a damaged file."""
     size = 0
-    try:
-        with gzip.open(path) as packed:
-            while block := packed.read(GZIP_BLOCK):
-                size += len(block)
-                if size > encoded.MAX_BYTES:
-                    raise InputError(
-                        path, f"more than {encoded.MAX_BYTES} bytes when unpacked", "no more"
-                    )
-                file.write(block)
-    except (gzip.BadGzipFile, EOFError, zlib.error):
-        raise InputError(path, "not a complete gzip file") from None
+    damaged = (gzip.BadGzipFile, EOFError, zlib.error)
+    with refusing(damaged, path, "not a complete gzip file"), gzip.open(path) as packed:
+        while block := packed.read(GZIP_BLOCK):
+            size += len(block)
+            if size > encoded.MAX_BYTES:
+                raise InputError(
+                    path, f"more than {encoded.MAX_BYTES} bytes when unpacked", "no more"
+                )
+            file.write(block)
     file.flush()
 
 
@@ -360,10 +358,9 @@ def read_pictures(path: Path) -> list[ViewedImage]:
 
 def read_npy(path: Path) -> Array:
     """The array of an NPY file, mapped until its size is checked, since it may declare any. Raises InputError."""
-    try:
+    # A damaged header gives errors of many types.
+    with refusing(Exception, path, "not a complete NPY file"):
         stored = np.lib.format.open_memmap(path, mode="r")
-    except Exception:  # of many types, for a damaged header
-        raise InputError(path, "not a complete NPY file") from None
     check_pixels(path, *stored.shape, each_bytes=stored.itemsize)
     kind = stored.dtype.newbyteorder("=")
     # Half precision ends at 65504.

@@ -36,7 +36,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
 from skysim.core.constants import INCH_M
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_under, refusing
 from skysim.core.types import Floats, frozen
 from skysim.core.yaml_reader import suggestion
 
@@ -142,13 +142,11 @@ def in_si(value: str, si_unit: str | None = None) -> float:
     inch = units.def_unit("in", units.imperial.inch)
     if len(value) > MAX_CHARACTERS:
         raise InputError("", f"{len(value)} characters", f"up to {MAX_CHARACTERS}")
-    with units.add_enabled_units([inch, units.imperial]):
-        try:
-            number = units.Quantity(value)
-            return float(number.to_value(si_unit) if si_unit else number.si.value)
-        except (TypeError, ValueError, ArithmeticError) as error:
-            # UnitsError is a ValueError; "3 m(1/0)" and "3 m(9e9)" raise others.
-            raise InputError("", error) from None
+    # UnitsError is a ValueError; "3 m(1/0)" and "3 m(9e9)" raise others.
+    kinds = (TypeError, ValueError, ArithmeticError)
+    with units.add_enabled_units([inch, units.imperial]), refusing(kinds, ""):
+        number = units.Quantity(value)
+        return float(number.to_value(si_unit) if si_unit else number.si.value)
 
 
 def within(least: float, most: float) -> Any:
@@ -252,10 +250,8 @@ def quantities_within(
         texts, ranges.items(), strict=True
     ):
         key = f"{section}.{name}"
-        try:
+        with errors_under(key):
             value = quantity(unit, what, example)(text)
-        except InputError as error:
-            raise error.under(key) from None
         if not low <= value <= high:
             raise InputError(key, text, f"{low:g} to {high:g}{unit and f' {unit}'}")
         values.append(value)

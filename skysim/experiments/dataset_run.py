@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from skysim.core import __version__
-from skysim.core.errors import OVERRIDES, InputError, check_name
+from skysim.core.errors import OVERRIDES, InputError, check_name, refusing
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Array, Record, frozen
 from skysim.core.yaml_reader import (
@@ -284,10 +284,8 @@ ZARR_ARRAY = "images"
 
 def require_zarr() -> Any:
     """The package zarr. Raises InputError."""
-    try:
+    with refusing(ImportError, "dataset.formats", f"zarr {EXTRA}"):
         import zarr
-    except ImportError:
-        raise InputError("dataset.formats", f"zarr {EXTRA}") from None
     return zarr
 
 

@@ -20,7 +20,7 @@ from estimator.core.types import Centroids, ra_dec_roll_rad
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.types import (
     ATTITUDES,
@@ -284,10 +284,8 @@ class Storage:
     def __init__(self, url: str) -> None:
         if "memory://" in url:
             raise InputError(url, "is lost at the end of the process", URLS)
-        try:
+        with refusing(ImportError, url, f"a dataset {EXTRA}"):
             from fsspec.core import url_to_fs
-        except ImportError:
-            raise InputError(url, f"a dataset {EXTRA}") from None
         try:
             self.files, self.root = url_to_fs(url)
         except ImportError as error:
@@ -550,11 +548,9 @@ def coco_file(images: list[Record], annotations: list[bytes]) -> bytes:
 
 def parquet(columns: Record) -> bytes:
     """A Parquet file of some columns, the same bytes for the same columns. Raises InputError without pyarrow."""
-    try:
+    with refusing(ImportError, "", f"a dataset {EXTRA}"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError:
-        raise InputError("", f"a dataset {EXTRA}") from None
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.table(columns), sink, compression="zstd")
     return bytes(sink.getvalue())

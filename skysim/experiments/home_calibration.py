@@ -39,7 +39,7 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.files import make_folder
 from skysim.core.types import UP, Array, Floats, Ints, Record, lengths, normalized
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
@@ -247,10 +247,8 @@ def calibrated(
     """
     common = complete(list(sightings(known, frames)))
     camera = scaled(known, common[0], clicks) if clicks else known.camera
-    try:
+    with refusing(ImageError, "frames"):
         catalog = calibrate(common, camera, known.leds, known.lever)
-    except ImageError as error:
-        raise InputError("frames", str(error)) from None
     body_m = np.array(
         [body_positions(one.xy_px, camera, known.leds, known.lever) for one in common]
     )
@@ -465,11 +463,9 @@ def write_results(
     page = make_folder(folder) / "report.html"
     made.save(page)
     catalog = folder / "leds.ecsv"
-    try:
+    with refusing(ImageError, "catalog"):
         write_dome_map(catalog, catalog_map(known, found))
         numbers["map"] = str(catalog)
-    except ImageError as error:
-        raise InputError("catalog", str(error)) from None
     return numbers | {"report": str(page)}, made
 
 

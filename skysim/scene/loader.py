@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from skysim.core import yaml_reader
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, errors_under, errors_within, unknown_name
 from skysim.core.paths import DATA, SCENES, shipped_files
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
@@ -63,10 +63,8 @@ def preset_path(name: str) -> Path:
 def preset(name: str) -> Tree:
     """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
     path = preset_path(name)
-    try:
+    with errors_within("camera.preset"):
         camera = resolve_files(path, read_yaml(path)[0]).get("camera")
-    except InputError as error:
-        raise error.within("camera.preset") from None
     if not isinstance(camera, dict) or "preset" in camera:
         raise InputError(
             "camera.preset", f"{path} is not a camera", "a section camera without a preset"
@@ -112,10 +110,8 @@ def with_heads(tree: Tree) -> Tree:
             continue
         own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
         main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
-        try:
+        with errors_under(f"heads.{n}"):
             completed[n] = head | with_preset(over_base(main, own))
-        except InputError as error:
-            raise error.under(f"heads.{n}") from None
     return tree | {"heads": completed}
 
 
@@ -134,10 +130,8 @@ def calibrated_keys(path: Path, camera: Tree) -> Tree:
     The focal length in meters follows from the camera's pixel pitch and focus, which the file does not contain.
     Raises InputError.
     """
-    try:
+    with errors_within("camera.calibration"):
         calibration = read_calibration(path)
-    except InputError as error:
-        raise error.within("camera.calibration") from None
     try:
         pixel_m = quantity("m", "length", '"5.5 um"')(camera.get("pixel"))
         focus_m = focus_distance(camera.get("focus", "infinity"))

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from skysim.core import files
 from skysim.core.constants import MAS_RAD
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, errors_within, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.text import LARGEST, cells_of, column_numbers, read_lines
 from skysim.core.types import Floats, Ints, Record, frozen
@@ -292,10 +292,8 @@ def info(name_or_path: str | Path) -> Record:
 def read_for(key: str, name: str) -> Catalog:
     """The stars of the catalog that a scene's key names. Raises InputError that begins with the key."""
     path = require_catalog(key, name)
-    try:
+    with errors_within(key):
         return read(path)
-    except InputError as error:
-        raise error.within(key) from None
 
 
 def require_catalog(key: str, name: str) -> Path:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, printable, reason
+from skysim.core.errors import InputError, printable, reason, refusing
 from skysim.core.plugins import (
     FOLDER,
     MAX_STATUS_CHARS,
@@ -346,10 +346,8 @@ def program_commands(options: Sequence[str] | None) -> dict[str, str]:
 
 def split_command(name: str, command: str) -> tuple[list[str], str | None]:
     """The arguments of a command, and the file format of its `{folder}`; None without one. Raises InputError."""
-    try:
+    with refusing(ValueError, f"programs.{name}"):
         arguments = shlex.split(command)
-    except ValueError as error:
-        raise InputError(f"programs.{name}", error) from None
     formats = {image_format or "png" for image_format in FOLDER.findall(command)}
     if formats - set(WRITERS) or len(formats) > 1:
         raise InputError(

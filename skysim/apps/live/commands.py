@@ -25,7 +25,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
-from skysim.core.errors import InputError, check_name
+from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats
 from skysim.dynamics.flight_computer import Commands
@@ -187,12 +187,10 @@ class CommandState:
             )
         if not isinstance(value, dict) or set(value) != set(SOLUTION_KEYS):
             raise InputError("attitude", repr(value)[:40], ", ".join(SOLUTION_KEYS))
-        try:
+        with refusing(ValueError, "attitude"):
             t_s = float(finite_array(value["t_s"], "t_s", ()))
             quaternion = finite_array(value["cam_from_ref_xyzw"], "cam_from_ref_xyzw", (4,))
             covariance = finite_array(value["covariance_rad2"], "covariance_rad2", (3, 3))
-        except ValueError as error:
-            raise InputError("attitude", error) from None
         if abs(math.hypot(*quaternion) - 1) > QUATERNION_TOLERANCE:
             raise InputError("attitude", "cam_from_ref_xyzw is not a unit quaternion")
         least, _, most = np.linalg.eigvalsh(covariance)

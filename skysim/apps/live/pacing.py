@@ -39,7 +39,7 @@ from skysim.apps.live.packets import (
     solution_packet,
     values_of,
 )
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.plugins import finite_array
 from skysim.core.types import Floats, Trajectory
 from skysim.simulation.flight import Flight, Shot
@@ -293,12 +293,10 @@ def pose_samples(pose: Any, in_orbit: bool) -> dict[str, Floats]:
         raise InputError("pose", f"{pose!r:.60}", ", ".join(keys))
     count = len(pose["t_s"]) if isinstance(pose["t_s"], list) else 0
     require_within("number of samples", count, 2, MOST_SAMPLES)
-    try:
+    with refusing(ValueError, "pose"):
         values = {"t_s": finite_array(pose["t_s"], "t_s", (count,))}
         for key, (size, *_) in vectors.items():
             values[key] = finite_array(pose[key], key, (count, size))
-    except ValueError as error:
-        raise InputError("pose", error) from None
     require_within("t_s", values["t_s"], 0.0, LATEST_S)
     require_within("step of t_s", np.diff(values["t_s"]), *STEP_S)
     for key, (_, *limits) in vectors.items():

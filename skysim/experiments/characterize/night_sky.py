@@ -18,7 +18,7 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.types import Array, Floats, joined, median, taken
 from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
 from skysim.experiments.characterize.photon_transfer import (
@@ -328,10 +328,8 @@ def read_frame(
         numbers = np.ascontiguousarray(numbers[::-1])
     images.check_size(path, numbers, (config.height_px, config.width_px))
     numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
-    try:
+    with refusing(ImageError, path):
         centroids = detect_and_centroid(numbers, calibration(config), settings, Clock())
-    except ImageError as error:
-        raise InputError(path, error) from None
     signal = transfer.linear_dn(numbers - transfer.values[BLACK])
     chosen = measurable(numbers, centroids, transfer, settings.saturation)
     gain, _, read = transfer.values[: READ + 1].tolist()

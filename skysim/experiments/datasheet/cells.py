@@ -16,7 +16,7 @@ import yaml
 
 from skysim.camera import as_built
 from skysim.core.constants import DAY_S, HOUR_S
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_within
 from skysim.core.files import make_folder, write_text
 from skysim.core.types import Array, Bools, Floats, Record
 from skysim.core.yaml_reader import OverrideTexts, parse_yaml
@@ -517,10 +517,8 @@ def planned(
     write_text(path, text)
     plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
     for cell in cells:
-        try:
+        with errors_within(cell.name):
             resolve_point(plan.spec, cell.settings)
-        except InputError as error:
-            raise error.within(cell.name) from None
     return plan
 
 

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
-from skysim.core.errors import InputError, check_name
+from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.time import in_utc
 from skysim.core.types import ATTITUDES, Array, Record, median
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
@@ -225,10 +225,8 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> Paths:
 
     Units are in the field metadata. Raises InputError if pyarrow is not installed.
     """
-    try:
+    with refusing(ImportError, "export.formats", f"parquet {EXTRA}"):
         import pyarrow.parquet
-    except ImportError:
-        raise InputError("export.formats", f"parquet {EXTRA}") from None
     tables = {"truth": truth_table(run, bar)}
     tables |= {
         name: table
@@ -314,10 +312,8 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
     InputError
         If zarr is not installed or the frames differ in size or type.
     """
-    try:
+    with refusing(ImportError, "export.formats", f"zarr {EXTRA}"):
         import zarr
-    except ImportError:
-        raise InputError("export.formats", f"zarr {EXTRA}") from None
     path = out / ZARR
     count = len(run.stems)
     columns = frame_columns(run, bar)
