@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.detector import Detector
@@ -29,7 +28,7 @@ from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError, errors_under
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import CAMERA_TIMING, JITTER, random_stream
-from skysim.core.types import Floats, Mount, Sources, frozen
+from skysim.core.types import Array, Floats, Mount, Sources, frozen
 from skysim.core.units import scaled_errors
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
@@ -295,7 +294,7 @@ class StarCamera:
     optics: Optics
     detector: Detector
     band: Band
-    canvas: NDArray
+    canvas: Array
     lights: tuple[Light, ...]
     channels: tuple[ColorChannel, ...]
     orbit: CameraOrbit | None

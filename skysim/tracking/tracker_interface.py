@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError, printable, reason, refusing
@@ -31,7 +30,7 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
-from skysim.core.types import Floats, Ints, Record, frozen
+from skysim.core.types import Array, Floats, Ints, Record, frozen
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.scene.sections.tracker import OWN
 
@@ -165,7 +164,7 @@ class Picture:
         Motion (dx, dy) of the images in the exposure, if a gyro measures it; else None
     """
 
-    image_dn: NDArray
+    image_dn: Array
     frame: int
     t_s: float
     exposure_s: float

@@ -41,7 +41,7 @@ from skysim.apps.live.packets import (
 )
 from skysim.core.errors import InputError, refusing
 from skysim.core.plugins import finite_array
-from skysim.core.types import Floats, Trajectory
+from skysim.core.types import Floats, Record, Trajectory
 from skysim.simulation.flight import Flight, Shot
 from skysim.sources.orbit_elements import OemOrbit
 from skysim.tracking.onboard_model import OrbitStarTracker
@@ -129,7 +129,7 @@ class Live:
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
 
     @property
-    def greeting(self) -> dict[str, Any]:
+    def greeting(self) -> Record:
         """What a client receives first: the scene, control period, camera, and the actuators with their motors."""
         flight = self.flight
         scene = flight.lab.scene
@@ -251,7 +251,7 @@ class Live:
             if packet.channel in output.channels:
                 output.offer(packet, patient=not self.pace.speed)
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Record:
         """Counts, delay statistics in ms, and the counters of each output."""
         late_ms = self.late_ms or [np.nan]
         commands = self.commands
@@ -326,7 +326,7 @@ class PosedLive(Live):
     closed_s: float = 0.0
 
     @property
-    def greeting(self) -> dict[str, Any]:
+    def greeting(self) -> Record:
         """As that of a live flight, with the time that the samples of a pose have to cover."""
         window = self.flight.schedules[0].window_to(0.0)
         return super().greeting | {"exposure_s": -window.open_s}

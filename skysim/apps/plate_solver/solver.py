@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.catalog import catalog as star_catalog
 from estimator.core.camera import Camera
@@ -42,7 +41,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
-from skysim.core.types import Bools, frozen
+from skysim.core.types import Array, Bools, frozen
 
 if TYPE_CHECKING:
     from skysim.scene.sections.camera import DetectorConfig
@@ -389,7 +388,7 @@ def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
 
 
 def solve_array(
-    image: NDArray,
+    image: Array,
     solver: Solver,
     centroids: Centroids | None = None,
     efforts: int | None = None,

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from skysim.camera import detector
@@ -21,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.core.text import read_named_rows
-from skysim.core.types import Bools, Floats, median
+from skysim.core.types import Array, Bools, Floats, median
 from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
@@ -31,7 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
-Numbers = NDArray[np.uint16]  # (H, W) digital numbers of a frame
+Numbers = Array[np.uint16]  # (H, W) digital numbers of a frame
 TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
