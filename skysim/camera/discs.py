@@ -15,7 +15,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from skysim.camera.optics import Optics
@@ -30,6 +29,7 @@ from skysim.camera.projection import (
 from skysim.camera.psf.kernel_cache import source_kernels
 from skysim.camera.render import STEP, OcclusionTest, Window, draw, render
 from skysim.core.types import (
+    Array,
     Bools,
     Floats,
     Ints,
@@ -178,7 +178,7 @@ def star_images(body: BodyLight, disc: DiscOnChip, exposed: Exposed) -> Displace
 
 
 def render_disc(
-    image: NDArray, body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
+    image: Array, body: BodyLight, disc: DiscOnChip, exposed: Exposed, hidden: Hidden | None
 ) -> list[SourceTruth]:
     """Draw a large disc by the module's steps; return its truth, or an empty list if it misses the chip.
 
@@ -256,7 +256,7 @@ COARSE = 16  # places across a disc at which the vehicle is tested for hiding it
 
 
 def render_bodies(
-    image: NDArray,
+    image: Array,
     bodies: Sequence[BodyLight],
     exposed: Exposed,
     occluded: OcclusionTest | None = None,
@@ -299,7 +299,7 @@ def centers_of(bodies: Sequence[BodyLight]) -> Sources:
 
 
 def render_points(
-    image: NDArray,
+    image: Array,
     body: BodyLight,
     resolved: bool,
     exposed: Exposed,
@@ -321,7 +321,7 @@ def render_points(
 
 
 def whole(
-    own_e: NDArray,
+    own_e: Array,
     corner_px: Ints,
     body: BodyLight,
     center_px: Floats,

@@ -21,10 +21,9 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import frozen
+from skysim.core.types import Array, frozen
 
 # Directories of TIFF files, and of the EXIF blocks of JPEG and PNG files, which have the same structure.
 
@@ -224,7 +223,7 @@ PNM_MAGICS = (b"P2", b"P3", b"P5", b"P6")  # PGM and PPM, as text and binary
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp", ".webp", ".pgm", ".ppm")
 
 
-def decode_images(path: Path, data: bytes) -> tuple[list[NDArray], bool]:
+def decode_images(path: Path, data: bytes) -> tuple[list[Array], bool]:
     """The images (H, W) or (H, W, channels), blue first, of a file's bytes, and whether they are raw Bayer frames.
 
     OpenCV applies the orientation of a TIFF file, but not that of PNG and JPEG. Raises InputError.
@@ -403,7 +402,7 @@ def read_exif(data: bytes) -> Exif:
     return Exif()
 
 
-def upright(image: NDArray, orientation: int) -> NDArray:
+def upright(image: Array, orientation: int) -> Array:
     """The upright image (H, W, ...): rotated and mirrored by EXIF's orientation, 1 to 8."""
     # Orientations above 4 are transposed; the other two bits mirror rows and columns.
     if orientation > 4:

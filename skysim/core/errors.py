@@ -4,7 +4,8 @@ import os
 import signal
 import sys
 import weakref
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import NamedTuple
@@ -143,6 +144,38 @@ class InputError(ValueError):
     def at(self, where: Where | None) -> "InputError":
         """The error with its place in a file."""
         return InputError(self.key, self.problem, self.allowed, where)
+
+
+@contextmanager
+def refusing(
+    kinds: type[Exception] | tuple[type[Exception], ...],
+    key: object,
+    problem: object = None,
+    allowed: object = "",
+) -> Iterator[None]:
+    """Turn errors of some kinds into InputError, with their own text as the problem unless there is another."""
+    try:
+        yield
+    except kinds as error:
+        raise InputError(key, problem or error, allowed) from None
+
+
+@contextmanager
+def errors_under(prefix: object) -> Iterator[None]:
+    """Put the key of the enclosing section before the key of an InputError."""
+    try:
+        yield
+    except InputError as error:
+        raise error.under(prefix) from None
+
+
+@contextmanager
+def errors_within(key: object) -> Iterator[None]:
+    """Give an InputError a key whose value names the input at fault."""
+    try:
+        yield
+    except InputError as error:
+        raise error.within(key) from None
 
 
 def check_name(key: object, kind: str, name: object, allowed: Collection[object]) -> None:

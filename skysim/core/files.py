@@ -15,10 +15,10 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, Where, shortened
 from skysim.core.text import Line, read_lines
+from skysim.core.types import Array, Record
 
 HOST = f"{zlib.crc32(platform.node().encode()):08x}"  # distinguishes machines that share a folder
 
@@ -155,7 +155,7 @@ def make_folder(path: Path) -> Path:
     return path
 
 
-def write_png16(path: Path, image_dn: NDArray) -> None:
+def write_png16(path: Path, image_dn: Array) -> None:
     """Write digital numbers as a 16-bit PNG; those of a noise-free frame are rounded."""
     numbers = np.clip(np.rint(image_dn), 0, 65535).astype(np.uint16)
     write_image(path, numbers)
@@ -165,7 +165,7 @@ def write_png16(path: Path, image_dn: NDArray) -> None:
 UNCOMPRESSED_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)
 
 
-def write_image(path: Path, image: NDArray) -> None:
+def write_image(path: Path, image: Array) -> None:
     """Write an image in the format of the path's suffix.
 
     Raises
@@ -250,7 +250,7 @@ def read_table(path: Path) -> Any:
     raise Where(path, lines[bad][0]).error("no row of the table")
 
 
-def header_numbers(path: Path, meta: dict[str, Any], key: str, count: int) -> list[float]:
+def header_numbers(path: Path, meta: Record, key: str, count: int) -> list[float]:
     """The `count` numbers under a key of an ECSV header.
 
     Raises InputError unless they are finite, and positive for a size or focal length.
@@ -284,13 +284,15 @@ def to_json(data: Any) -> str:
     """JSON text of data, with null for NaN and infinity."""
 
     def without_nan(value: Any) -> Any:
-        """The value with NumPy's numbers as Python's, and None for NaN and infinity."""
+        """The value with NumPy's arrays and numbers as Python's, paths as text, and None for NaN and infinity."""
+        if isinstance(value, np.ndarray | np.generic):
+            value = value.tolist()
         if isinstance(value, dict):
             return {key: without_nan(item) for key, item in value.items()}
         if isinstance(value, list | tuple):
             return [without_nan(item) for item in value]
-        if isinstance(value, np.generic):
-            value = value.item()
+        if isinstance(value, Path):
+            return str(value)
         return None if isinstance(value, float) and not np.isfinite(value) else value
 
     return json.dumps(without_nan(data), indent=1, allow_nan=False)

@@ -24,16 +24,15 @@ from typing import IO, Any, BinaryIO
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core import encoded
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.encoded import check_pixels, silent_stderr
-from skysim.core.errors import InputError, reason
+from skysim.core.errors import InputError, reason, refusing
 from skysim.core.files import strict_warnings
 from skysim.core.guarded import run_guarded
 from skysim.core.text import LARGEST
-from skysim.core.types import Record, frozen
+from skysim.core.types import Array, Record, frozen
 from skysim.core.yaml_reader import check_bytes
 
 # FITS images: plain, gzipped (.gz) or compressed in tiles (.fz), monochrome or color, with their
@@ -139,17 +138,15 @@ def open_fits(path: Path) -> Iterator[BinaryIO]:
 def unpack(path: Path, file: IO[bytes]) -> None:
     """Unpack a gzipped file, up to MAX_BYTES. Raises InputError for more, and for a damaged file."""
     size = 0
-    try:
-        with gzip.open(path) as packed:
-            while block := packed.read(GZIP_BLOCK):
-                size += len(block)
-                if size > encoded.MAX_BYTES:
-                    raise InputError(
-                        path, f"more than {encoded.MAX_BYTES} bytes when unpacked", "no more"
-                    )
-                file.write(block)
-    except (gzip.BadGzipFile, EOFError, zlib.error):
-        raise InputError(path, "not a complete gzip file") from None
+    damaged = (gzip.BadGzipFile, EOFError, zlib.error)
+    with refusing(damaged, path, "not a complete gzip file"), gzip.open(path) as packed:
+        while block := packed.read(GZIP_BLOCK):
+            size += len(block)
+            if size > encoded.MAX_BYTES:
+                raise InputError(
+                    path, f"more than {encoded.MAX_BYTES} bytes when unpacked", "no more"
+                )
+            file.write(block)
     file.flush()
 
 
@@ -187,7 +184,7 @@ def check_hdu(path: Path, hdu: Any) -> None:
     check_pixels(path, int(hdu.size) // 8)
 
 
-def decode_guarded(path: Path, what: str, *arguments: str) -> NDArray:
+def decode_guarded(path: Path, what: str, *arguments: str) -> Array:
     """The pixels that the script `fits_tiles` decodes in a child process. Raises InputError with one line."""
     with tempfile.TemporaryDirectory(prefix="skysim-") as folder:
         out = Path(folder) / "pixels.npy"
@@ -199,7 +196,7 @@ def decode_guarded(path: Path, what: str, *arguments: str) -> NDArray:
         return np.load(out)
 
 
-def planes(path: Path, pixels: NDArray) -> list[NDArray]:
+def planes(path: Path, pixels: Array) -> list[Array]:
     """The images of an array: (H, W), a color image (3, H, W) or (H, W, 3), red first, as (H, W, 3), blue first, or N.
 
     Raises
@@ -294,7 +291,7 @@ class ViewedImage:
         EXPTIME or EXPOSURE, CCD-TEMP or DET-TEMP of a FITS header; None without a number
     """
 
-    pixels: NDArray
+    pixels: Array
     date_utc: datetime.datetime | None = None
     focal_35mm: float | None = None
     row_order_known: bool = True
@@ -359,19 +356,18 @@ def read_pictures(path: Path) -> list[ViewedImage]:
     return pages
 
 
-def read_npy(path: Path) -> NDArray:
+def read_npy(path: Path) -> Array:
     """The array of an NPY file, mapped until its size is checked, since it may declare any. Raises InputError."""
-    try:
+    # A damaged header gives errors of many types.
+    with refusing(Exception, path, "not a complete NPY file"):
         stored = np.lib.format.open_memmap(path, mode="r")
-    except Exception:  # of many types, for a damaged header
-        raise InputError(path, "not a complete NPY file") from None
     check_pixels(path, *stored.shape, each_bytes=stored.itemsize)
     kind = stored.dtype.newbyteorder("=")
     # Half precision ends at 65504.
     return np.array(stored, np.float32 if kind == np.float16 else kind, order="C")
 
 
-def read_camera_raw(path: Path) -> NDArray:
+def read_camera_raw(path: Path) -> Array:
     """The pixels of a digital camera's raw file, each with its color filter. Raises InputError, also without rawpy."""
     if importlib.util.find_spec("rawpy") is None:
         raise InputError(
@@ -421,7 +417,7 @@ def as_light(picture: ViewedImage) -> ViewedImage:
     return replace(picture, pixels=pixels, scale=scale, notes=tuple(notes))
 
 
-def read_image(path: Path) -> NDArray:
+def read_image(path: Path) -> Array:
     """The pixels of `read_ordered`."""
     return read_ordered(path).pixels
 
@@ -475,7 +471,7 @@ def best_images(
     return best
 
 
-def check_size(path: Path, pixels: NDArray, shape: tuple[int, int]) -> None:
+def check_size(path: Path, pixels: Array, shape: tuple[int, int]) -> None:
     """Raise InputError unless an image has the (height, width) of its camera."""
     if pixels.shape != shape:
         raise InputError(
@@ -499,7 +495,7 @@ def is_fits(path: Path) -> bool:
     return path.name.lower().endswith(SUFFIXES)
 
 
-def monochrome(image: NDArray) -> NDArray:
+def monochrome(image: Array) -> Array:
     """Luminance of a color image (alpha is ignored); a monochrome one unchanged. Raises InputError."""
     if image.ndim == 2:
         return image
@@ -533,7 +529,7 @@ class LiveCamera:
                 cv2.CAP_PROP_BUFFERSIZE, 1
             )  # the newest frame, not a buffered one
 
-    def frame(self) -> NDArray:
+    def frame(self) -> Array:
         """The next frame, (H, W) or (H, W, 3). Raises InputError if there is none."""
         with silent_stderr():
             ok, frame = self.capture.read()
@@ -559,7 +555,7 @@ def video_numbers(path: Path) -> tuple[float, int]:
     return rate_hz, count
 
 
-def grab_frame(source: str) -> NDArray:
+def grab_frame(source: str) -> Array:
     """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
     with closing(LiveCamera(source)) as camera:
         return camera.frame()

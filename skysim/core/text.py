@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.errors import InputError, Where, shortened
+from skysim.core.errors import InputError, Where, refusing, shortened
 from skysim.core.time import GPS_MINUS_TAI_S, SCALES
 from skysim.core.types import Floats
 from skysim.core.yaml_reader import read_limited
@@ -131,12 +131,10 @@ def seconds_since(
             raise
         times.precision = 9
     # 3. Difference from the start in whole nanoseconds.
-    try:
+    with refusing(ValueError, source, "an epoch within a leap second", "other times"):
         nanoseconds = np.array(times.isot, dtype="datetime64[ns]") - np.datetime64(
             start, "ns"
         )
-    except ValueError:
-        raise InputError(source, "an epoch within a leap second", "other times") from None
     return nanoseconds.astype(np.int64) / 1e9 - (GPS_MINUS_TAI_S if system == "GPS" else 0.0)
 
 

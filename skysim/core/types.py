@@ -7,16 +7,16 @@ from functools import cached_property
 from typing import Any, NamedTuple, TypeVar, dataclass_transform
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import NDArray as Array  # of numbers of any type
 from scipy.spatial.transform import Rotation
 
 from skysim.core.quaternion import from_rotation, interpolate, to_rotation
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
+Floats = Array[np.float64]
+Ints = Array[np.int64]
 Record = dict[str, Any]  # values by name, as an object in JSON or a row of a table
-Bools = NDArray[np.bool_]
-Singles = NDArray[np.float32]
+Bools = Array[np.bool_]
+Singles = Array[np.float32]
 
 
 def lengths(vectors: Floats) -> Floats:
@@ -29,7 +29,7 @@ def normalized(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def around_z(radius: Any, azimuth_rad: NDArray, z: Any) -> Floats:
+def around_z(radius: Any, azimuth_rad: Array, z: Any) -> Floats:
     """(..., 3) points at distances from the z axis, azimuths from +x toward +y, and heights; these are broadcast."""
     x = radius * np.cos(azimuth_rad)
     y = radius * np.sin(azimuth_rad)
@@ -51,7 +51,7 @@ def homogeneous(rows: Floats, last: float) -> Floats:
     return np.column_stack([rows, np.full(len(rows), last)])
 
 
-def grid_points(x: NDArray, y: NDArray) -> Floats:
+def grid_points(x: Array, y: Array) -> Floats:
     """(N, 2) points of a grid, row by row."""
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
@@ -59,6 +59,11 @@ def grid_points(x: NDArray, y: NDArray) -> Floats:
 def positive(values: Floats) -> Floats:
     """The values above zero, and NaN for the others."""
     return np.where(values > 0, values, np.nan)
+
+
+def median(values: Any) -> float:
+    """The median of numbers, as a number of Python."""
+    return float(np.median(values))
 
 
 Kind = TypeVar("Kind")
@@ -357,7 +362,7 @@ class Sources:
         """(N,) fractions of the time for which they are lit."""
         return np.minimum(self.on_s / self.period_s, 1.0)
 
-    def take(self, which: NDArray) -> "Sources":
+    def take(self, which: Array) -> "Sources":
         """The sources selected by a mask or by indices."""
         rows = np.flatnonzero(which) if which.dtype == bool else which
         columns = (getattr(self, name) for name in Sources.__dataclass_fields__)
@@ -561,7 +566,7 @@ class Frame:
     """
 
     index: int
-    image_dn: NDArray
+    image_dn: Array
     t_mid_s: float
     exposure_s: float
     saturation_dn: float

@@ -36,7 +36,7 @@ from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema, core_schema
 
 from skysim.core.constants import INCH_M
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_under, refusing
 from skysim.core.types import Floats, frozen
 from skysim.core.yaml_reader import suggestion
 
@@ -142,13 +142,21 @@ def in_si(value: str, si_unit: str | None = None) -> float:
     inch = units.def_unit("in", units.imperial.inch)
     if len(value) > MAX_CHARACTERS:
         raise InputError("", f"{len(value)} characters", f"up to {MAX_CHARACTERS}")
-    with units.add_enabled_units([inch, units.imperial]):
-        try:
-            number = units.Quantity(value)
-            return float(number.to_value(si_unit) if si_unit else number.si.value)
-        except (TypeError, ValueError, ArithmeticError) as error:
-            # UnitsError is a ValueError; "3 m(1/0)" and "3 m(9e9)" raise others.
-            raise InputError("", error) from None
+    # UnitsError is a ValueError; "3 m(1/0)" and "3 m(9e9)" raise others.
+    kinds = (TypeError, ValueError, ArithmeticError)
+    with units.add_enabled_units([inch, units.imperial]), refusing(kinds, ""):
+        number = units.Quantity(value)
+        return float(number.to_value(si_unit) if si_unit else number.si.value)
+
+
+def within(least: float, most: float) -> Any:
+    """The bounds of a number that may be equal to either."""
+    return Field(ge=least, le=most)
+
+
+def above(limit: float, most: float) -> Any:
+    """The bounds of a number that is greater than the first and may be equal to the second."""
+    return Field(gt=limit, le=most)
 
 
 # Of any type: a value above zero, and one of zero or more; lists of one or more, two or more, three.
@@ -158,6 +166,7 @@ ZeroOrMore = Annotated[Item, Field(ge=0)]
 NotEmpty = Annotated[tuple[Item, ...], Field(min_length=1)]
 Several = Annotated[tuple[Item, ...], Field(min_length=2)]
 Three = tuple[Item, Item, Item]
+ZEROS = (0.0, 0.0, 0.0)
 # Every number has a least and a greatest value. Those of quantities are beyond any laboratory that could be built: a
 # hall of 10 km, a vehicle of 1000 t, a run of a century. A section narrows them where it knows better.
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -183,25 +192,25 @@ PositiveLength = AboveZero[Length]
 Position = Three[Length]
 Duration = AboveZero[Time]
 Delay = ZeroOrMore[Time]
-TimeLimit = Annotated[Time, Field(ge=1e-3, le=3600)]
+TimeLimit = Annotated[Time, within(1e-3, 3600)]
 # An angle or a rate.
-Spin = Annotated[Number, Field(ge=-360, le=360)]
+Spin = Annotated[Number, within(-360, 360)]
 Spins = Three[Spin]
 RightAscension = Annotated[Number, Field(ge=0, lt=360)]
-Declination = Annotated[Number, Field(ge=-90, le=90)]
-AxisAngle = Annotated[Number, Field(ge=0, le=180)]
-Magnitude = Annotated[Number, Field(ge=-30, le=30)]
-Temperature = Annotated[Number, Field(ge=-150, le=150)]
-Seed = Annotated[int, Field(ge=0, le=1e18)]
-Whole = Annotated[int, Field(ge=0, le=1_000_000_000)]
+Declination = Annotated[Number, within(-90, 90)]
+AxisAngle = Annotated[Number, within(0, 180)]
+Magnitude = Annotated[Number, within(-30, 30)]
+Temperature = Annotated[Number, within(-150, 150)]
+Seed = Annotated[int, within(0, 1e18)]
+Whole = Annotated[int, within(0, 1_000_000_000)]
 PositiveInt = Annotated[Whole, Field(ge=1)]
-Fraction = Annotated[Number, Field(ge=0, le=1)]
-PositiveFraction = Annotated[Number, Field(gt=0, le=1)]
+Fraction = Annotated[Number, within(0, 1)]
+PositiveFraction = Annotated[Number, above(0, 1)]
 InnerFraction = Annotated[Number, Field(gt=0, lt=1)]
-WITHIN_BILLION = Field(ge=-1e9, le=1e9)
+WITHIN_BILLION = within(-1e9, 1e9)
 # Of any unit: all parts (ppm), most of a turn in arcseconds, a clock of a THz in MHz.
-Positive = Annotated[Number, Field(gt=0, le=1e6)]
-NotNegative = Annotated[Number, Field(ge=0, le=1e6)]
+Positive = Annotated[Number, above(0, 1e6)]
+NotNegative = Annotated[Number, within(0, 1e6)]
 Signed = Annotated[Number, WITHIN_BILLION]
 Fractions = Several[Fraction]
 # Options of a program of the user, which knows their meaning.
@@ -241,10 +250,8 @@ def quantities_within(
         texts, ranges.items(), strict=True
     ):
         key = f"{section}.{name}"
-        try:
+        with errors_under(key):
             value = quantity(unit, what, example)(text)
-        except InputError as error:
-            raise error.under(key) from None
         if not low <= value <= high:
             raise InputError(key, text, f"{low:g} to {high:g}{unit and f' {unit}'}")
         values.append(value)

@@ -14,7 +14,8 @@ import difflib
 import functools
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from decimal import Decimal
 from pathlib import Path
 from typing import Annotated, Any
@@ -402,15 +403,14 @@ PATTERNS = {
 }
 
 
-def explain(
-    error: ValidationError, tree: Tree, files: Files, overrides: OverrideTexts
-) -> InputError:
-    """The first error of a validation: `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
+@contextmanager
+def explained(tree: Tree, files: Files, overrides: OverrideTexts) -> Iterator[None]:
+    """Raise the first error of a validation as an InputError.
+
+    Such as `light.kind: unknown kind 'domes'; allowed: … (scenes/x.yaml, line 31)`.
 
     Parameters
     ----------
-    error
-        Error of pydantic
     tree
         Merged content of the files
     files
@@ -418,8 +418,13 @@ def explain(
     overrides
         YAML texts by dotted key
     """
+    try:
+        yield
+        return
+    except ValidationError as error:
+        faults = error.errors()
     # 1. A key of another section may be missing too.
-    first = min(error.errors(), key=lambda item: item["type"] == "missing")
+    first = min(faults, key=lambda item: item["type"] == "missing")
     missing = first["type"] == "missing"
     # 2. Keys and problem.
     keys = [str(key) for key in yaml_keys(first["loc"], tree, missing)]
@@ -429,7 +434,7 @@ def explain(
     # 3. A missing key has no line of its own, so the line is that of its section. (A file may have the key in a section
     # or list that another file replaces.)
     where = where_of(keys[:-1] if missing else keys, files, overrides)
-    return InputError(excerpt(".".join(keys)), found.problem, found.allowed, where)
+    raise InputError(excerpt(".".join(keys)), found.problem, found.allowed, where) from None
 
 
 def fault_of(error: ErrorDetails) -> InputError:

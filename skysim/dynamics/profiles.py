@@ -43,7 +43,7 @@ from xml.etree.ElementTree import ParseError, XMLPullParser
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, Where, unknown_name
+from skysim.core.errors import InputError, Where, errors_within, unknown_name
 from skysim.core.files import read_table
 from skysim.core.text import (
     Line,
@@ -481,14 +481,12 @@ def load_profiles(
         if isinstance(element, ProfileConfig):
             # A given table replaces the file of the first profile.
             source = given if given is not None and not profiles else Path(element.file)
-            try:
+            with errors_within(f"motion.maneuver.{n}"):
                 samples = read_profile(source, in_utc(scene.start_time), element.rotation)
                 samples = check_samples(to_body(samples, scene, mount))
                 if scene.vehicle.gimbals:
                     samples = on_gimbals(samples, scene.vehicle.gimbals)
                 profiles.append(AttitudeSpline(samples))
-            except InputError as error:
-                raise error.within(f"motion.maneuver.{n}") from None
     return tuple(profiles)
 
 

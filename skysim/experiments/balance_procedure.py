@@ -23,7 +23,7 @@ from estimator.calibration.mass_dynamics import (
 from estimator.calibration.mass_properties import estimate_with_noise, filter_mass
 from estimator.core.errors import ImageError
 from skysim.core import files
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_under, refusing
 from skysim.core.types import Floats, Record
 from skysim.core.units import quantity
 from skysim.dynamics import guidance
@@ -115,10 +115,8 @@ def parse_bars(torque: str, inertia_percent: float, offset: str | None) -> Bars:
     """Parse the bars. Raises InputError if one is not a torque or length, or not positive."""
 
     def positive(name: str, text: str, unit: str, what: str, example: str) -> float:
-        try:
+        with errors_under(f"balance.{name}"):
             value = quantity(unit, what, example)(text)
-        except InputError as error:
-            raise error.under(f"balance.{name}") from None
         if not value > 0:
             raise InputError(f"balance.{name}", text, "above 0")
         return value
@@ -195,10 +193,8 @@ def balance(
             in_flight(scene, plan, number, position_m), assumptions, uncertainty, watch
         )
         records.append(flown.record)
-        try:
+        with refusing(ImageError, "balance"):  # it does not converge
             estimate = estimate_with_noise(records, assumptions.lab, assumptions.prior)
-        except ImageError as error:  # it does not converge
-            raise InputError("balance", error) from error
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
         if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
             position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
@@ -282,7 +278,7 @@ def flight_row(number: int, one: Iteration) -> Record:
     per_um = 1e6 / mass.mass_kg
     return {
         "flight": number,
-        "duration_s": float(one.flight.record.t_s[-1]),
+        "duration_s": one.flight.record.t_s[-1],
         "frames": one.flight.frames,
         "solved": one.flight.solved,
         "after_contact": one.flight.after_contact,
@@ -358,10 +354,8 @@ def draw_flights(fig: Any, statistics: Record, record: BearingRecord) -> None:
 
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
     """As `estimate_rows`, for the filter in flight at the end of one iteration. Raises InputError for few attitudes."""
-    try:
+    with refusing(ImageError, "balance"):
         *_, last = filter_mass(one.flight.record, assumptions.lab, assumptions.prior)
-    except ImageError as error:
-        raise InputError("balance", error) from error
     return estimate_rows(one.flight, last)
 
 

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core import __version__
-from skysim.core.errors import OVERRIDES, InputError, check_name
+from skysim.core.errors import OVERRIDES, InputError, check_name, refusing
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Record, frozen
+from skysim.core.types import Array, Record, frozen
 from skysim.core.yaml_reader import (
     OverrideTexts,
     check_version,
@@ -286,10 +285,8 @@ ZARR_ARRAY = "images"
 
 def require_zarr() -> Any:
     """The package zarr. Raises InputError."""
-    try:
+    with refusing(ImportError, "dataset.formats", f"zarr {EXTRA}"):
         import zarr
-    except ImportError:
-        raise InputError("dataset.formats", f"zarr {EXTRA}") from None
     return zarr
 
 
@@ -311,7 +308,7 @@ def create_zarr(storage: Storage, plan: DatasetPlan) -> None:
     )
 
 
-def write_zarr(storage: Storage, first: int, images: list[NDArray], shard: int) -> None:
+def write_zarr(storage: Storage, first: int, images: list[Array], shard: int) -> None:
     """Write the images of one shard, which is one object. Raises InputError for an image of another size."""
     array = require_zarr().open_group(storage.zarr_store(ZARR), mode="r+")[ZARR_ARRAY]
     for n, image in enumerate(images):

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -21,10 +20,11 @@ from estimator.core.types import Centroids, ra_dec_roll_rad
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.camera.detector import PARTICLES, SMEAR, AddedCharge
 from skysim.camera.render import Window
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.types import (
     ATTITUDES,
+    Array,
     Floats,
     Frame,
     Ints,
@@ -107,7 +107,7 @@ class LabelledFrame(NamedTuple):
 
     frame: Frame
     truth: Truth
-    sources: NDArray
+    sources: Array
     extents: Extents
     unmatched_px: Floats
     masks: dict[str, list[int]]
@@ -173,7 +173,7 @@ def label_frame(
     return LabelledFrame(frame, truth, sources, extents, unmatched, runs)
 
 
-def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[NDArray, Floats]:
+def source_rows(truth: SourceTruth, found_px: Floats) -> tuple[Array, Floats]:
     """(N,) labels of the sources, brightest first, and the (M, 2) detections that belong to no source.
 
     A detection belongs to the brightest free source whose distance is at most SAME_LIGHT_PX plus half the length of
@@ -210,7 +210,7 @@ def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Int
     return chosen
 
 
-def image_extents(rows: NDArray, window: Window, height_px: int) -> Extents:
+def image_extents(rows: Array, window: Window, height_px: int) -> Extents:
     """The rectangle about each source's streak.
 
     On each side it is wider than the streak by REACH_SIGMA standard deviations of the blur, or by the radius of a disc
@@ -249,7 +249,7 @@ def across_sigma_px(area_px: Floats, streak_px: Floats) -> Floats:
     return np.sqrt((np.sqrt(square**2 + 4 * area_px**2) - square) / (8 * math.pi))
 
 
-def run_lengths(mask: NDArray, least: float = True) -> list[int]:
+def run_lengths(mask: Array, least: float = True) -> list[int]:
     """Lengths of the runs of an (H, W) mask, column by column, beginning with pixels that are not set: COCO's code.
 
     Parameters
@@ -285,10 +285,8 @@ class Storage:
     def __init__(self, url: str) -> None:
         if "memory://" in url:
             raise InputError(url, "is lost at the end of the process", URLS)
-        try:
+        with refusing(ImportError, url, f"a dataset {EXTRA}"):
             from fsspec.core import url_to_fs
-        except ImportError:
-            raise InputError(url, f"a dataset {EXTRA}") from None
         try:
             self.files, self.root = url_to_fs(url)
         except ImportError as error:
@@ -552,11 +550,9 @@ def coco_file(images: list[Record], annotations: list[bytes]) -> bytes:
 
 def parquet(columns: Record) -> bytes:
     """A Parquet file of some columns, the same bytes for the same columns. Raises InputError without pyarrow."""
-    try:
+    with refusing(ImportError, "", f"a dataset {EXTRA}"):
         import pyarrow
         import pyarrow.parquet
-    except ImportError:
-        raise InputError("", f"a dataset {EXTRA}") from None
     sink = pyarrow.BufferOutputStream()
     pyarrow.parquet.write_table(pyarrow.table(columns), sink, compression="zstd")
     return bytes(sink.getvalue())
@@ -567,7 +563,7 @@ def index_table(rows: list[Record]) -> bytes:
     return parquet({name: [row[name] for row in rows] for name in rows[0]})
 
 
-def sources_table(frames: list[int], sources: list[NDArray]) -> bytes:
+def sources_table(frames: list[int], sources: list[Array]) -> bytes:
     """The sources of a shard: a row for each source of each frame."""
     rows = np.concatenate(sources)
     number = np.repeat(frames, [len(one) for one in sources])

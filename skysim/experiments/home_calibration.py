@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation, Slerp
 
@@ -40,9 +39,9 @@ from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.detection.detect import THESIS_AREA_PX
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.files import make_folder
-from skysim.core.types import UP, Floats, Ints, Record, lengths, normalized
+from skysim.core.types import UP, Array, Floats, Ints, Record, lengths, normalized
 from skysim.experiments.dome_survey.survey_frames import CalibrationPrior, calibration_prior
 from skysim.experiments.dome_survey.survey_procedure import (
     ATTITUDES,
@@ -124,7 +123,7 @@ class HeldFrame(NamedTuple):
     magnitude: Floats
 
 
-def measure(image_dn: NDArray[Any], scene: Scene) -> tuple[Floats, Floats]:
+def measure(image_dn: Array, scene: Scene) -> tuple[Floats, Floats]:
     """(N, 2) centroids and (N,) magnitudes of the lights of an image (Padro 2012, sections 3.4.1.3 and 3.6.2.1).
 
     As the thesis does with MATLAB's `bwlabel` and `regionprops`, by their counterparts in scikit-image: regions of at
@@ -205,9 +204,7 @@ def apart_deg(a: Rotation, b: Rotation) -> float:
     return float(np.degrees((a.inv() * b).magnitude()))
 
 
-def name_lights(
-    known: CalibrationPrior, frame: HeldFrame
-) -> tuple[NDArray[Any], NDArray[Any]]:
+def name_lights(known: CalibrationPrior, frame: HeldFrame) -> tuple[Array, Array]:
     """Rows of the map and of the frame's lights that are each other's nearest, within half the least spacing.
 
     An error of the IMU moves all images alike, so a frame with all its LEDs is first moved onto the expected ones.
@@ -250,10 +247,8 @@ def calibrated(
     """
     common = complete(list(sightings(known, frames)))
     camera = scaled(known, common[0], clicks) if clicks else known.camera
-    try:
+    with refusing(ImageError, "frames"):
         catalog = calibrate(common, camera, known.leds, known.lever)
-    except ImageError as error:
-        raise InputError("frames", str(error)) from None
     body_m = np.array(
         [body_positions(one.xy_px, camera, known.leds, known.lever) for one in common]
     )
@@ -340,9 +335,7 @@ def statistics(found: Calibration) -> Record:
     return {
         "frames": len(found.stop),
         "focal_px": found.camera.focal_px,
-        "leds": [
-            {"led": int(found.led[n])} | spread(found, found.magnitude[:, n]) for n in order
-        ],
+        "leds": [{"led": found.led[n]} | spread(found, found.magnitude[:, n]) for n in order],
         "ranks": [spread(found, column) for column in ranked.T],
         "pairs": [spread(found, column) for column in ascending.T],
         "distinct": len(groups) + 1,
@@ -355,34 +348,33 @@ def statistics(found: Calibration) -> Record:
             "position_mm": 1e3 * found.catalog.epsilon_pos_m,
             "separation_arcsec": found.catalog.epsilon_sep_rad / ARCSEC_RAD,
         },
-        "height_range_mm": float(np.ptp(columns_mm[:, :, 2])),
+        "height_range_mm": np.ptp(columns_mm[:, :, 2]),
         "difference_deg": differences(difference_deg),
         "stops": [
             {
                 "frames": len(one),
-                "imu_deg": found.imu_deg[n].tolist(),
-                "algorithm_deg": found.algorithm_deg[n].tolist(),
-                "difference_deg": difference_deg[n].tolist(),
-                "x_mm": one[:, :, 0].mean(axis=0).tolist(),
+                "imu_deg": found.imu_deg[n],
+                "algorithm_deg": found.algorithm_deg[n],
+                "difference_deg": difference_deg[n],
+                "x_mm": one[:, :, 0].mean(axis=0),
             }
             for n, one in enumerate(by_stop(found, columns_mm))
         ],
     }
 
 
-def differences(difference_deg: Floats) -> dict[str, list[float]]:
+def differences(difference_deg: Floats) -> dict[str, Floats]:
     """Table 15: least, largest and mean absolute difference of each angle over the stops, and its deviation (n - 1).
 
     A single stop has no deviation, NaN.
     """
     absolute = np.abs(difference_deg)
-    columns = {
+    return {
         "least": absolute.min(axis=0),
         "largest": absolute.max(axis=0),
         "mean": absolute.mean(axis=0),
         "sd": deviation(absolute),
     }
-    return {name: one.tolist() for name, one in columns.items()}
 
 
 def spread(found: Calibration, values: Floats) -> Record:
@@ -392,7 +384,7 @@ def spread(found: Calibration, values: Floats) -> Record:
 
 def moments(values: Floats) -> Record:
     """Mean and standard deviation (n - 1) of (F,) values; NaN for the deviation of one."""
-    return {"mean": float(values.mean()), "sd": float(deviation(values))}
+    return {"mean": values.mean(), "sd": deviation(values)}
 
 
 def deviation(values: Floats) -> Any:
@@ -471,11 +463,9 @@ def write_results(
     page = make_folder(folder) / "report.html"
     made.save(page)
     catalog = folder / "leds.ecsv"
-    try:
+    with refusing(ImageError, "catalog"):
         write_dome_map(catalog, catalog_map(known, found))
         numbers["map"] = str(catalog)
-    except ImageError as error:
-        raise InputError("catalog", str(error)) from None
     return numbers | {"report": str(page)}, made
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError
-from skysim.core.types import Frame, Record, Truth
+from skysim.core.types import Frame, Record, Truth, median
 from skysim.results import metrics, scoring
 from skysim.results.scoring import FrameRow
 from skysim.scene.scene import Scene
@@ -118,7 +118,7 @@ def score_tracker(tracker: str, rows: Sequence[FrameRow]) -> TrackerScore:
         failed,
         **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in right]),
         nees=float(np.mean(nees)),
-        time_ms_median=float(np.median(ms)),
+        time_ms_median=median(ms),
         time_ms_p95=float(np.percentile(ms, 95)),
         refusals=dict(unsolved.most_common()),
     )

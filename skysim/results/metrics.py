@@ -17,13 +17,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 from scipy.special import chdtri
 
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Floats
+from skysim.core.types import Array, Floats
 
 WRONG_RAD = np.radians(10 / 60)  # limit of PTASE for a wrong attitude: ten arcminutes
 WRONG_AS_CLAIMED_RAD = np.radians(1)  # limit for an error that the covariance allows
@@ -215,7 +214,7 @@ def mean_of(values: Floats, function: Callable[[Any], Any] = np.positive) -> Sum
 
 
 @lru_cache(maxsize=64)
-def resampling_counts(count: int) -> NDArray[np.uint8]:
+def resampling_counts(count: int) -> Array[np.uint8]:
     """(count, RESAMPLES) how often each resample has drawn each value."""
     drawn = random_stream(1).integers(0, count, (RESAMPLES, count))
     drawn += count * np.arange(RESAMPLES)[:, None]
@@ -343,7 +342,7 @@ def sample_std(values: Floats, axis: int = -1) -> Any:
 
 # Responses: statistics over trials. Each trial is a row; the columns are arrays, NaN where it has no such value.
 
-Columns = Mapping[str, NDArray]
+Columns = Mapping[str, Array]
 DEFAULT_COVERAGE = 5  # "5 stars everywhere" (Padro 2012)
 Response = Callable[[Columns], Summary]
 
@@ -372,7 +371,7 @@ FLIGHT_QUANTITIES = (
     "exposure_ms",
 )
 # The beginning of a response name. Errors are taken as magnitudes.
-QUANTITIES: dict[str, Callable[[Columns], NDArray]] = {
+QUANTITIES: dict[str, Callable[[Columns], Array]] = {
     "cross_arcsec": lambda c: np.hypot(c["x_arcsec"], c["y_arcsec"]),
     "roll_arcsec": lambda c: np.abs(c["roll_arcsec"]),
     "angle_arcsec": lambda c: np.sqrt(
@@ -439,7 +438,7 @@ def overconfident(c: Columns) -> Summary:
     return proportion(np.sum(c["nees"][solved] > OVERCONFIDENT_NEES), np.sum(solved))
 
 
-def proportion_of_frames(hits: NDArray, frames: NDArray) -> Summary:
+def proportion_of_frames(hits: Array, frames: Array) -> Summary:
     """A proportion of all frames.
 
     The frames of one simulated run are correlated. Where trials have many frames, the interval is therefore that of
@@ -495,7 +494,7 @@ LIMIT = re.compile(r"((?:cross|roll|angle)_arcsec)_([\d.]+)")
 OVER = re.compile(r"(\w+)_over_(\d[\d.e+-]*)$")
 
 
-def right_within(name: str, c: Columns) -> NDArray:
+def right_within(name: str, c: Columns) -> Array:
     """(N,) whether each trial is solved in all frames, none of them wrong, with errors up to the limits in a name."""
     right = (c["frames"] > 0) & (c["solved"] == c["frames"]) & (c["wrong"] == 0)
     within = [QUANTITIES[error](c) <= float(limit) for error, limit in LIMIT.findall(name)]

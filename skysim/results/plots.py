@@ -6,13 +6,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.constants import SIGMA_PER_MAD
-from skysim.core.types import Floats, SourceTruth
+from skysim.core.types import Array, Bools, Floats, Record, SourceTruth, median
 from skysim.sources.satellites import light_name
 
-Picture = NDArray[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
+Picture = Array[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
 Color = tuple[int, int, int]  # BGR
 DPI = 120
 # Palette for color-blind readers (Okabe & Ito 2008), plus two colors.
@@ -107,7 +106,7 @@ def stacked_axes(heights_in: Sequence[float]) -> tuple[Any, list[Any]]:
 # Convert frames to 8-bit images for display, and encode them as JPEG.
 
 
-CURVES: dict[str, Any] = {
+CURVES: Record = {
     "square root": np.sqrt,
     "linear": lambda fraction: fraction,
     "logarithm": lambda fraction: np.log1p(200 * fraction) / np.log1p(200),
@@ -124,7 +123,7 @@ class FrameStatistics(NamedTuple):
     saturated: int
 
 
-def display_levels(image: NDArray) -> tuple[float, float]:
+def display_levels(image: Array) -> tuple[float, float]:
     """Black and white levels in DN: the sky (30th percentile), and the 99.9th percentile or, if that is higher,
     a quarter of the way from the sky to the brightest pixel."""
     low, high = np.percentile(image[::SAMPLE_STRIDE, ::SAMPLE_STRIDE], (30, 99.9))
@@ -132,7 +131,7 @@ def display_levels(image: NDArray) -> tuple[float, float]:
 
 
 def to_8bit(
-    image: NDArray, curve: str, levels_dn: tuple[float, float] | None = None
+    image: Array, curve: str, levels_dn: tuple[float, float] | None = None
 ) -> Picture:
     """(H, W) uint8 image, stretched from the black level to the white level by one of CURVES.
 
@@ -155,7 +154,7 @@ def to_8bit(
     return gray[image] if tabulated else gray
 
 
-def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
+def frame_statistics(image: Array, saturation_dn: float) -> FrameStatistics:
     """Sky median and standard deviation from a sample of the pixels; peak and saturation count from all of them.
 
     Stars are excluded from the standard deviation by a clip at five sigma, with sigma = 1.4826 x the median absolute
@@ -163,11 +162,9 @@ def frame_statistics(image: NDArray, saturation_dn: float) -> FrameStatistics:
     deviation are integers and the deviation can be 0.
     """
     sample = image[:: 2 * SAMPLE_STRIDE, ::SAMPLE_STRIDE].astype(float)
-    sky = float(np.median(sample))
+    sky = median(sample)
     deviation = np.abs(sample - sky)
-    background = sample[
-        deviation <= max(5 * SIGMA_PER_MAD * float(np.median(deviation)), 3.0)
-    ]
+    background = sample[deviation <= max(5 * SIGMA_PER_MAD * median(deviation), 3.0)]
     peak = float(image.max())
     saturated = int(np.count_nonzero(image >= saturation_dn)) if peak >= saturation_dn else 0
     return FrameStatistics(sky, float(background.std()), peak, saturated)
@@ -194,7 +191,7 @@ DETECTED_BGR = (80, 80, 235)
 MATCHED_BGR = (110, 220, 90)
 
 
-def enlarged(image: NDArray) -> tuple[Picture, int, int]:
+def enlarged(image: Array) -> tuple[Picture, int, int]:
     """The stretched frame in BGR, its scale (2 if smaller than 1000 pixels), and the size of markers in pixels."""
     scale = 2 if max(image.shape) < 1000 else 1
     picture = cv2.cvtColor(to_8bit(image, "square root"), cv2.COLOR_GRAY2BGR)
@@ -205,13 +202,13 @@ def enlarged(image: NDArray) -> tuple[Picture, int, int]:
     return picture, scale, max(8, min(picture.shape[:2]) // 70)
 
 
-def visible(sources: SourceTruth) -> NDArray[np.bool_]:
+def visible(sources: SourceTruth) -> Bools:
     """(N,) whether a true source has a signal-to-noise ratio above MIN_SNR, or none is known."""
     return ~(sources.snr <= MIN_SNR)
 
 
 def annotate(
-    image: NDArray,
+    image: Array,
     detected_px: Floats,
     matched_px: Floats,
     labels: list[str] | None = None,
@@ -241,7 +238,7 @@ def annotate(
     return with_legend(picture, meanings)
 
 
-def annotate_truth(image: NDArray, sources: SourceTruth) -> Picture:
+def annotate_truth(image: Array, sources: SourceTruth) -> Picture:
     """The stretched frame in BGR with ticks at the flux centroid of each visible source and the 40 brightest labeled.
 
     Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.

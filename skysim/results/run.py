@@ -22,6 +22,7 @@ from skysim.core.types import (
     Trajectory,
     Truth,
     frozen,
+    median,
 )
 from skysim.dynamics import imu
 from skysim.results import requirements, run_report, scoring, telemetry_report
@@ -117,9 +118,7 @@ class Recorder:
         assert self.shown is not None
         annotated = self.shown.annotated()
         write_image(self.folder / "annotated.png", annotated)
-        stages_ms = {
-            stage: 1e3 * float(np.median(seconds)) for stage, seconds in self.seconds.items()
-        }
+        stages_ms = {stage: 1e3 * median(seconds) for stage, seconds in self.seconds.items()}
         computer = scene.tracker.computer
         has_plot = len(self.rows) > 1 or log.t_s[-1] > SHORT_S
         flight = telemetry_report.figure(log) if has_plot else b""

@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from estimator.identification import refusals as reasons
-from skysim.core.types import Record
+from skysim.core.types import Record, median
 from skysim.results import metrics, scoring
 from skysim.results.plots import Picture, figure_png, stacked_axes
 from skysim.results.report import (
@@ -159,7 +159,7 @@ def summary(rows: Rows) -> Record:
         **scoring.error_statistics([(row.cross_arcsec, row.roll_arcsec) for row in solved]),
         "scatter_arcsec": scatter_arcsec(solved),
         **claims(solved),
-        "time_ms_median": float(np.median([row.time_ms for row in rows])),
+        "time_ms_median": median([row.time_ms for row in rows]),
         **magnitude_errors(rows),
     }
 
@@ -175,8 +175,8 @@ def claims(solved: Rows) -> dict[str, float]:
     }
     shares = np.nan_to_num([row.survey_share for row in known])
     return sizes | {
-        "nees_mean": float(np.mean([row.nees for row in known])),
-        "survey_share": float(np.mean(shares)),
+        "nees_mean": np.mean([row.nees for row in known]),
+        "survey_share": np.mean(shares),
     }
 
 
@@ -208,9 +208,9 @@ def magnitude_errors(rows: Rows) -> Record:
     mean = np.average(means, weights=stars)
     squares = np.sum((stars - 1) * sigmas**2 + stars * (means - mean) ** 2)
     return {
-        "magnitude_error_mag_mean": float(mean),
-        "magnitude_error_mag_sigma": float(np.sqrt(squares / (stars.sum() - 1))),
-        "magnitude_stars": int(stars.sum()),
+        "magnitude_error_mag_mean": mean,
+        "magnitude_error_mag_sigma": np.sqrt(squares / (stars.sum() - 1)),
+        "magnitude_stars": stars.sum(),
     }
 
 

@@ -7,13 +7,12 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, RateEstimate, ra_dec_roll_rad
 from estimator.trackers.pipeline import Report
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Frame, Record, Truth, frozen
+from skysim.core.types import Array, Frame, Record, Truth, frozen
 from skysim.results import metrics
 from skysim.results.plots import Picture, annotate, reduce_width, visible
 from skysim.results.report import embed
@@ -266,7 +265,7 @@ class Score:
         self.row = row(shot.camera, shot.frame, shot.truth, shot.solution, shot.update_status)
 
     @property
-    def image(self) -> NDArray[Any]:
+    def image(self) -> Array:
         """(H, W) digital numbers: uint16, or float64 for a noise-free detector."""
         return self.shot.frame.image_dn
 

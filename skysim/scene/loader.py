@@ -20,10 +20,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pydantic import ValidationError
-
 from skysim.core import yaml_reader
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, errors_under, errors_within, unknown_name
 from skysim.core.paths import DATA, SCENES, shipped_files
 from skysim.core.units import ConfigModel, quantity
 from skysim.core.yaml_reader import (
@@ -33,7 +31,7 @@ from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
     check_version,
-    explain,
+    explained,
     is_file,
     read_yaml,
     set_key,
@@ -65,10 +63,8 @@ def preset_path(name: str) -> Path:
 def preset(name: str) -> Tree:
     """The `camera` section of data/cameras/NAME.yaml, or of a file. Raises InputError for an unknown name."""
     path = preset_path(name)
-    try:
+    with errors_within("camera.preset"):
         camera = resolve_files(path, read_yaml(path)[0]).get("camera")
-    except InputError as error:
-        raise error.within("camera.preset") from None
     if not isinstance(camera, dict) or "preset" in camera:
         raise InputError(
             "camera.preset", f"{path} is not a camera", "a section camera without a preset"
@@ -114,10 +110,8 @@ def with_heads(tree: Tree) -> Tree:
             continue
         own = {key: head[key] for key in HEAD_SECTIONS if isinstance(head.get(key), dict)}
         main = {key: tree[key] for key in own if isinstance(tree.get(key), dict)}
-        try:
+        with errors_under(f"heads.{n}"):
             completed[n] = head | with_preset(over_base(main, own))
-        except InputError as error:
-            raise error.under(f"heads.{n}") from None
     return tree | {"heads": completed}
 
 
@@ -136,10 +130,8 @@ def calibrated_keys(path: Path, camera: Tree) -> Tree:
     The focal length in meters follows from the camera's pixel pitch and focus, which the file does not contain.
     Raises InputError.
     """
-    try:
+    with errors_within("camera.calibration"):
         calibration = read_calibration(path)
-    except InputError as error:
-        raise error.within("camera.calibration") from None
     try:
         pixel_m = quantity("m", "length", '"5.5 um"')(camera.get("pixel"))
         focus_m = focus_distance(camera.get("focus", "infinity"))
@@ -329,11 +321,9 @@ def validate(layers: list["Layer"], overrides: OverrideTexts) -> Scene:
     """The scene of layers and overrides: steps 2 to 4 of the module's docstring. Raises InputError."""
     tree = with_overrides(merged(layers), overrides)
     files = locations(layers)
-    try:
+    with explained(tree, files, overrides):
         raw = apply_preset(tree, files, overrides)
         scene = Scene.model_validate(raw | {NAME_ALIAS: layers[0].path.stem})
-    except ValidationError as error:
-        raise explain(error, tree, files, overrides) from None
     trees = (with_overrides({}, overrides), *(layer.tree for layer in layers))
     scene._inherited = inherited_keys(trees)
     scene._source = RawKeys(tree)
@@ -574,11 +564,9 @@ def load_camera(
     tree = with_overrides(tree, overrides)
     if isinstance(tree.get("camera"), dict):
         tree = tree | {"camera": {**(lens or {}), **tree["camera"]}}
-    try:
+    with explained(tree, files, overrides):
         raw = camera_tree(path, tree, files, overrides)
         return CameraFileConfig.model_validate(raw).camera
-    except ValidationError as error:
-        raise explain(error, tree, files, overrides) from None
 
 
 def camera_tree(path: Path, tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:

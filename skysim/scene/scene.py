@@ -19,6 +19,7 @@ from skysim.core.random_streams import HEAD_SEED, derived_seed
 from skysim.core.time import Moment
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     ConfigModel,
     Delay,
     Position,
@@ -28,8 +29,9 @@ from skysim.core.units import (
     Spins,
     Time,
     TimeError,
+    within,
 )
-from skysim.core.yaml_reader import Tree, excerpt, explain, fault_of
+from skysim.core.yaml_reader import Tree, excerpt, explained, fault_of
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.scene.sections.light import DomeConfig, FurtherLight, Light, StarsConfig
@@ -65,7 +67,7 @@ class ExposureConfig(ConfigModel):
     frames: PositiveInt
     first_s: Delay = 0.0
     trigger_jitter_s: Delay = 0.0
-    time_tag_offset_s: Annotated[Time, Field(ge=-1, le=1)] = 0.0
+    time_tag_offset_s: Annotated[Time, within(-1, 1)] = 0.0
     time_tag_jitter_s: Annotated[TimeError, Field(le=1)] = 0.0
 
     def check(self) -> None:
@@ -113,8 +115,8 @@ class HeadConfig(ConfigModel):
     name: Annotated[str, Field(pattern=r"^[a-z]\w*$", max_length=40)]
     position_m: Position
     rotation_deg: Spins
-    mount_error_arcsec: Coefficients = (0.0, 0.0, 0.0)
-    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
+    mount_error_arcsec: Coefficients = ZEROS
+    mount_arcsec_k: Coefficients = ZEROS
     camera: CameraConfig | None = None
     tracker: TrackerConfig | None = None
     exposure: ExposureConfig | None = None
@@ -179,10 +181,8 @@ class SceneKind(ModelMetaclass):
     """The class of `Scene`: a scene from Python's keywords is refused in one line, like one from a file."""
 
     def __call__(cls, /, **keys: Any) -> Any:
-        try:
+        with explained(keys, [], {}):
             return super().__call__(**keys)
-        except ValidationError as error:
-            raise explain(error, keys, [], {}) from None
 
 
 class Scene(ConfigModel, metaclass=SceneKind):

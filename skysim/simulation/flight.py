@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from estimator.core.types import RateEstimate
 from estimator.trackers.pipeline import Clock, Report
 from skysim.camera.render import Window
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.plugins import finite_array
 from skysim.core.quaternion import to_rotation
 from skysim.core.text import LARGEST
@@ -338,7 +338,7 @@ class Flight:
         unknown = [key for key in motors if key not in sets]
         if unknown:
             raise InputError(unknown[0], "no such actuators", ", ".join(sets))
-        try:
+        with refusing(ValueError, "step"):
             if torque_nm is not None:
                 # Its square must be finite; the actuators give far less.
                 torque_nm = finite_array(torque_nm, "torque_nm", (3,)).clip(-LARGEST, LARGEST)
@@ -349,8 +349,6 @@ class Flight:
                     for key, values in motors.items()
                 },
             )
-        except ValueError as error:
-            raise InputError("step", error) from None
 
     def refuse_in_shots(self, name: str) -> None:
         """Raise InputError inside a loop over `shots`."""

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.detector import Detector
@@ -26,10 +25,10 @@ from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import EXTENT
 from skysim.camera.render import Window
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_under
 from skysim.core.plugins import NO_PROGRAMS, Programs
 from skysim.core.random_streams import CAMERA_TIMING, JITTER, random_stream
-from skysim.core.types import Floats, Mount, Sources, frozen
+from skysim.core.types import Array, Floats, Mount, Sources, frozen
 from skysim.core.units import scaled_errors
 from skysim.core.yaml_reader import is_file
 from skysim.dynamics import guidance, multibody
@@ -295,7 +294,7 @@ class StarCamera:
     optics: Optics
     detector: Detector
     band: Band
-    canvas: NDArray
+    canvas: Array
     lights: tuple[Light, ...]
     channels: tuple[ColorChannel, ...]
     orbit: CameraOrbit | None
@@ -505,15 +504,13 @@ def build_head(n: int, plan: LightPlan, main: StarCamera, programs: Programs) ->
     scene = plan.scene.of_head(n)
     main_from_head = Rotation.from_rotvec(head.rotation_deg, degrees=True)
     mount = Mount(np.array(head.position_m), main_from_head.inv() * main.mount.cam_from_body)
-    try:
+    with errors_under(f"heads.{n}"):
         check_hardware(scene, programs, True)
         band = Band.from_camera(scene.camera) if head.camera else main.band
         known = None if head.camera else main.known
         plan = replace(plan, scene=scene, band=band, known=known, mount=mount)
         turned = Rotation.from_rotvec(np.array(head.mount_error_arcsec) * ARCSEC_RAD)
         return camera_of(head.name, plan, mount, main.run_seed, turned)
-    except InputError as error:
-        raise error.under(f"heads.{n}") from None
 
 
 def lab_from_body_start(

@@ -14,14 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from skysim.core import files
 from skysim.core.constants import MAS_RAD
-from skysim.core.errors import InputError, unknown_name
+from skysim.core.errors import InputError, errors_within, unknown_name
 from skysim.core.paths import CATALOGS
 from skysim.core.text import LARGEST, cells_of, column_numbers, read_lines
-from skysim.core.types import Floats, Ints, Record, frozen
+from skysim.core.types import Array, Floats, Ints, Record, frozen
 from skysim.core.yaml_reader import excerpt, is_file, parse_yaml, read_limited
 
 EPOCHS_JYEAR = 1800, 2200  # allowed epochs: linear proper motions hold for a century or two
@@ -94,7 +93,7 @@ class Catalog:
     def __len__(self) -> int:
         return len(self.hip)
 
-    def take(self, which: NDArray) -> "Catalog":
+    def take(self, which: Array) -> "Catalog":
         """The chosen stars, by mask or index."""
         # All fields but the epoch are arrays.
         arrays = [field.name for field in fields(self) if field.name != "epoch_jyear"]
@@ -292,10 +291,8 @@ def info(name_or_path: str | Path) -> Record:
 def read_for(key: str, name: str) -> Catalog:
     """The stars of the catalog that a scene's key names. Raises InputError that begins with the key."""
     path = require_catalog(key, name)
-    try:
+    with errors_within(key):
         return read(path)
-    except InputError as error:
-        raise error.within(key) from None
 
 
 def require_catalog(key: str, name: str) -> Path:

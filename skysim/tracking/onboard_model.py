@@ -22,7 +22,7 @@ from estimator.identification.led_codes import LedCode
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.optics import Optics
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.types import UP, Floats, Ints, Mount, Sources
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
@@ -256,12 +256,10 @@ def onboard_catalog(key: str, name: str) -> catalog.StarCatalog:
         Name in data/catalogs/, or a file, .ecsv or .cat
     """
     path = require_catalog(key, name)
-    try:
+    with refusing(ImageError, key):
         if path.suffix.lower() == ".cat":
             return cat_file.read_stars(path)
         return catalog.read(path)
-    except ImageError as error:
-        raise InputError(key, error) from None
 
 
 # A star tracker in orbit that gets the camera's velocity from the vehicle's navigation.

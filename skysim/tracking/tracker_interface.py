@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any, Literal, Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from skysim.core.errors import InputError, printable, reason
+from skysim.core.errors import InputError, printable, reason, refusing
 from skysim.core.plugins import (
     FOLDER,
     MAX_STATUS_CHARS,
@@ -31,7 +30,7 @@ from skysim.core.plugins import (
     finite_array,
     to_lists,
 )
-from skysim.core.types import Floats, Ints, Record, frozen
+from skysim.core.types import Array, Floats, Ints, Record, frozen
 from skysim.dynamics.controllers import CONTROLLERS
 from skysim.scene.sections.tracker import OWN
 
@@ -165,7 +164,7 @@ class Picture:
         Motion (dx, dy) of the images in the exposure, if a gyro measures it; else None
     """
 
-    image_dn: NDArray
+    image_dn: Array
     frame: int
     t_s: float
     exposure_s: float
@@ -346,10 +345,8 @@ def program_commands(options: Sequence[str] | None) -> dict[str, str]:
 
 def split_command(name: str, command: str) -> tuple[list[str], str | None]:
     """The arguments of a command, and the file format of its `{folder}`; None without one. Raises InputError."""
-    try:
+    with refusing(ValueError, f"programs.{name}"):
         arguments = shlex.split(command)
-    except ValueError as error:
-        raise InputError(f"programs.{name}", error) from None
     formats = {image_format or "png" for image_format in FOLDER.findall(command)}
     if formats - set(WRITERS) or len(formats) > 1:
         raise InputError(

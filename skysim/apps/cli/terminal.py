@@ -126,20 +126,11 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     ]
     rows = [
         [
-            line.tracker,
-            line.frames,
+            *line[:2],
             100 * line.right.value,
             f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
             Cell(str(line.wrong), "bad" if line.wrong else ""),
-            line.refused,
-            line.failed,
-            line.cross_arcsec_median,
-            line.cross_arcsec_worst,
-            line.roll_arcsec_median,
-            line.roll_arcsec_worst,
-            line.nees,
-            line.time_ms_median,
-            line.time_ms_p95,
+            *line[4:-1],
         ]
         for line in lines
     ]
@@ -227,7 +218,7 @@ def print_catalog(catalog: Record, json: bool) -> None:
 def print_titles(folder: Path, json: bool) -> None:
     """Print names and titles of the YAML files in a folder."""
     listed = [
-        {"name": path.stem, "title": title_of(path), "file": str(path)}
+        {"name": path.stem, "title": title_of(path), "file": path}
         for path in shipped_files(folder).values()
     ]
     print_list(listed, json, lambda entry: f"{entry['name']:20s} {printable(entry['title'])}")

@@ -25,9 +25,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude
-from skysim.core.errors import InputError, check_name
+from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.plugins import finite_array
-from skysim.core.types import Floats
+from skysim.core.types import Floats, Record
 from skysim.dynamics.flight_computer import Commands
 from skysim.simulation.flight import Flight
 from skysim.simulation.lab import longest_live_s
@@ -45,7 +45,7 @@ SOLUTION_KEYS = ("t_s", "cam_from_ref_xyzw", "covariance_rad2")
 Reply = Callable[[str], None]
 
 
-def parse(line: bytes) -> dict[str, Any]:
+def parse(line: bytes) -> Record:
     """The object in a line. Raises InputError for anything else."""
     with suppress(ValueError, RecursionError):
         found = json.loads(line)
@@ -58,9 +58,9 @@ class Inbox:
     """Commands that wait for the next control period, with the function that reports an error to their client."""
 
     def __init__(self) -> None:
-        self.waiting: deque[tuple[dict[str, Any], Reply]] = deque()
+        self.waiting: deque[tuple[Record, Reply]] = deque()
 
-    def put(self, command: dict[str, Any], reply: Reply) -> bool:
+    def put(self, command: Record, reply: Reply) -> bool:
         """Add a command; refuse it where too many wait. Return whether it waits."""
         if len(self.waiting) >= MOST_WAITING:
             reply(f"more than {MOST_WAITING} commands in a control period")
@@ -68,7 +68,7 @@ class Inbox:
         self.waiting.append((command, reply))
         return True
 
-    def take(self) -> Iterator[tuple[dict[str, Any], Reply]]:
+    def take(self) -> Iterator[tuple[Record, Reply]]:
         """All that waits; each command waits until its caller asks for the next."""
         for _ in range(len(self.waiting)):
             yield self.waiting[0]
@@ -130,7 +130,7 @@ class CommandState:
                 self.refused += 1
                 reply(str(error))
 
-    def apply(self, command: dict[str, Any]) -> None:
+    def apply(self, command: Record) -> None:
         """Check a command as a whole, then take it. Raises InputError."""
         flight = self.flight
         schedule = flight.schedules[0]
@@ -187,12 +187,10 @@ class CommandState:
             )
         if not isinstance(value, dict) or set(value) != set(SOLUTION_KEYS):
             raise InputError("attitude", repr(value)[:40], ", ".join(SOLUTION_KEYS))
-        try:
+        with refusing(ValueError, "attitude"):
             t_s = float(finite_array(value["t_s"], "t_s", ()))
             quaternion = finite_array(value["cam_from_ref_xyzw"], "cam_from_ref_xyzw", (4,))
             covariance = finite_array(value["covariance_rad2"], "covariance_rad2", (3, 3))
-        except ValueError as error:
-            raise InputError("attitude", error) from None
         if abs(math.hypot(*quaternion) - 1) > QUATERNION_TOLERANCE:
             raise InputError("attitude", "cam_from_ref_xyzw is not a unit quaternion")
         least, _, most = np.linalg.eigvalsh(covariance)

@@ -13,12 +13,11 @@ from collections.abc import Iterable
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera.discs import centers_of
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats, frozen, lengths
+from skysim.core.types import Array, Bools, Floats, Ints, frozen, lengths
 from skysim.scene.sections.layouts import (
     LcdConfig,
     LensDisplayConfig,
@@ -56,7 +55,7 @@ class DisplayPicture(NamedTuple):
         Number of lights brighter than white can show
     """
 
-    gray: NDArray[np.uint8]
+    gray: Array[np.uint8]
     shown: int
     faint: int
     limited: int
@@ -200,7 +199,7 @@ def lights_of(lits: Iterable[Lit], exposure: Exposure) -> tuple[Floats, Floats]:
     return np.concatenate(toward), np.concatenate(irradiance)
 
 
-def spots(xy_px: Floats, width: int) -> tuple[NDArray[np.int64], Floats]:
+def spots(xy_px: Floats, width: int) -> tuple[Ints, Floats]:
     """(N, 9) flat indices of the 3 x 3 pixels around each place (N, 2), and their (N, 9) shares of its light.
 
     The shares are the quadratic B-spline, (1/2 - u)^2 / 2, 3/4 - u^2 and (1/2 + u)^2 / 2 with the place's offset u from

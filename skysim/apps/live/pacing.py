@@ -39,9 +39,9 @@ from skysim.apps.live.packets import (
     solution_packet,
     values_of,
 )
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, refusing
 from skysim.core.plugins import finite_array
-from skysim.core.types import Floats, Trajectory
+from skysim.core.types import Floats, Record, Trajectory
 from skysim.simulation.flight import Flight, Shot
 from skysim.sources.orbit_elements import OemOrbit
 from skysim.tracking.onboard_model import OrbitStarTracker
@@ -129,7 +129,7 @@ class Live:
     late_ms: deque[float] = field(default_factory=lambda: deque(maxlen=DELAY_WINDOW))
 
     @property
-    def greeting(self) -> dict[str, Any]:
+    def greeting(self) -> Record:
         """What a client receives first: the scene, control period, camera, and the actuators with their motors."""
         flight = self.flight
         scene = flight.lab.scene
@@ -251,7 +251,7 @@ class Live:
             if packet.channel in output.channels:
                 output.offer(packet, patient=not self.pace.speed)
 
-    def statistics(self) -> dict[str, Any]:
+    def statistics(self) -> Record:
         """Counts, delay statistics in ms, and the counters of each output."""
         late_ms = self.late_ms or [np.nan]
         commands = self.commands
@@ -293,12 +293,10 @@ def pose_samples(pose: Any, in_orbit: bool) -> dict[str, Floats]:
         raise InputError("pose", f"{pose!r:.60}", ", ".join(keys))
     count = len(pose["t_s"]) if isinstance(pose["t_s"], list) else 0
     require_within("number of samples", count, 2, MOST_SAMPLES)
-    try:
+    with refusing(ValueError, "pose"):
         values = {"t_s": finite_array(pose["t_s"], "t_s", (count,))}
         for key, (size, *_) in vectors.items():
             values[key] = finite_array(pose[key], key, (count, size))
-    except ValueError as error:
-        raise InputError("pose", error) from None
     require_within("t_s", values["t_s"], 0.0, LATEST_S)
     require_within("step of t_s", np.diff(values["t_s"]), *STEP_S)
     for key, (_, *limits) in vectors.items():
@@ -328,7 +326,7 @@ class PosedLive(Live):
     closed_s: float = 0.0
 
     @property
-    def greeting(self) -> dict[str, Any]:
+    def greeting(self) -> Record:
         """As that of a live flight, with the time that the samples of a pose have to cover."""
         window = self.flight.schedules[0].window_to(0.0)
         return super().greeting | {"exposure_s": -window.open_s}

@@ -29,12 +29,11 @@ from typing import Any, BinaryIO, NamedTuple, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.core.types import Attitude
 from skysim.core import files
 from skysim.core.errors import InputError, printable, reason
-from skysim.core.types import Record
+from skysim.core.types import Array, Record
 from skysim.dynamics.imu import TIME_TOLERANCE_S
 from skysim.simulation.flight import Flight, Shot
 
@@ -64,8 +63,8 @@ class Packet(NamedTuple):
         Of a solution: all that the tracker found, for outputs in this process
     """
 
-    header: dict[str, Any]
-    pixels: NDArray[Any] = NO_PIXELS
+    header: Record
+    pixels: Array = NO_PIXELS
     truth: Mapping[str, Any] = MappingProxyType({})
     attitude: Attitude | None = None
 
@@ -74,7 +73,7 @@ class Packet(NamedTuple):
         return str(self.header["channel"])
 
     @property
-    def header_with_truth(self) -> dict[str, Any]:
+    def header_with_truth(self) -> Record:
         return self.header | ({"truth": dict(self.truth)} if self.truth else {})
 
     def pack(self, has_truth: bool = False) -> bytes:
@@ -84,7 +83,7 @@ class Packet(NamedTuple):
         return json.dumps(header).encode() + b"\n" + self.pixels.tobytes()
 
 
-def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
+def unpack(stream: BinaryIO) -> tuple[Record, Array] | None:
     """Read the next header and its (H, W) pixels; None at the end. Raises InputError for malformed or cut-off data."""
     line = stream.readline(MAX_HEADER_BYTES)
     if not line:
@@ -107,7 +106,7 @@ def unpack(stream: BinaryIO) -> tuple[dict[str, Any], NDArray[Any]] | None:
     return header, np.frombuffer(pixels, dtype).reshape(shape)
 
 
-def plain(values: Mapping[str, Any]) -> dict[str, Any]:
+def plain(values: Mapping[str, Any]) -> Record:
     """Copies of the values, as Python's numbers and lists."""
     return {key: np.asarray(value).tolist() for key, value in values.items()}
 
@@ -249,7 +248,7 @@ class Output(Protocol):
         """Send what is left, and end."""
         ...
 
-    def counters(self) -> dict[str, Any]:
+    def counters(self) -> Record:
         """What was sent and dropped."""
         ...
 
@@ -346,7 +345,7 @@ class Sink:
             self.dropped.update(one.channel for one in self.packets)
             self.packets.clear()
 
-    def counters(self) -> dict[str, Any]:
+    def counters(self) -> Record:
         return {"sent": dict(self.sent), "dropped": dict(self.dropped), "fault": self.fault}
 
 
@@ -371,7 +370,7 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
     return write
 
 
-def encode_png(pixels: NDArray[Any]) -> bytes:
+def encode_png(pixels: Array) -> bytes:
     """Encode the pixels as PNG at the lowest compression level, for speed."""
     return bytes(cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 1])[1])
 

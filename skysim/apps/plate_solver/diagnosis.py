@@ -21,7 +21,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.attitude.rate import covariance_of
 from estimator.core.camera import Camera
@@ -33,6 +32,7 @@ from estimator.detection.detect import DETECTORS, to_native
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from skysim.apps.plate_solver.solver import WIDEST_DEG, Solver, best_attitude, solve_centroids
+from skysim.core.types import Array
 
 # Expected numbers of stars in a field: hardly solvable below the first, safe above the second.
 MIN_CATALOG_STARS = 6.0
@@ -70,7 +70,7 @@ class Refusal:
         Whether the row order is known; if not, both orders, and so the mirrored sky, were tried
     """
 
-    image: NDArray
+    image: Array
     centroids: Centroids
     solvers: tuple[Solver, ...]
     row_order_known: bool = True
@@ -221,13 +221,13 @@ def out_of_focus(refusal: Refusal) -> str:
     return f"blobs of {typical_px:.0f} px: out of focus?" if is_most(large) else ""
 
 
-def brightest_shapes(blobs: Blobs) -> tuple[NDArray, NDArray]:
+def brightest_shapes(blobs: Blobs) -> tuple[Array, Array]:
     """Width and height, (N, 2), and area, (N,), of the brightest blobs, in pixels."""
     box_px = blobs.box_px[:SHAPED_BLOBS]
     return box_px[:, 2:] - box_px[:, :2] + 1, blobs.area_px[:SHAPED_BLOBS]
 
 
-def is_most(chosen: NDArray) -> bool:
+def is_most(chosen: Array) -> bool:
     """Whether the chosen blobs are most of the brightest ones, and not too few."""
     return bool(np.count_nonzero(chosen) >= MIN_BLOBS and chosen.mean() >= SAME_SHARE)
 
@@ -287,7 +287,7 @@ MIN_AREA_PX = 30
 MAX_SIGMA_PX = 20.0  # greatest error that `Centroids.check_values` allows
 
 
-def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Centroids]]:
+def large_lights(image: Array, settings: Settings) -> Iterator[tuple[int, Centroids]]:
     """The sides of the squares for which a picture's lights are large, and the centroids in pixels of the picture."""
     for factor in FACTORS:
         if min(image.shape) < factor * MIN_SIDE_PX:
@@ -305,7 +305,7 @@ def large_lights(image: NDArray, settings: Settings) -> Iterator[tuple[int, Cent
             continue
 
 
-def bin_pixels(image: NDArray, factor: int) -> NDArray[np.uint16]:
+def bin_pixels(image: Array, factor: int) -> Array[np.uint16]:
     """The means of squares of pixels, scaled to 16 bits; incomplete squares at the right and below are cut off."""
     height, width = (side // factor for side in image.shape)
     light = image[: height * factor, : width * factor].astype(np.float32)
@@ -330,7 +330,7 @@ def enlarged(centroids: Centroids, factor: int, settings: Settings) -> Centroids
 
 
 def centroids_of(
-    pixels: NDArray, settings: Settings, streak_px: tuple[float, float] | None = None
+    pixels: Array, settings: Settings, streak_px: tuple[float, float] | None = None
 ) -> Centroids:
     """The centroids of a picture, along a streak if one is given."""
     # The detection uses only the camera's size.
@@ -372,7 +372,7 @@ class Retry(NamedTuple):
     upper_half: bool = False
 
 
-def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterator[Retry]:
+def retries(pixels: Array, centroids: Centroids, settings: Settings) -> Iterator[Retry]:
     """Yield the retries of a picture; `centroids` are those of the refused attempt, in the unchanged picture."""
     yield from halves(pixels, centroids, "")
     flat = without_clouds(pixels, settings)
@@ -385,7 +385,7 @@ def retries(pixels: NDArray, centroids: Centroids, settings: Settings) -> Iterat
         yield Retry(BINNED.format(factor), MORE_EFFORTS, large)
 
 
-def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[Retry]:
+def halves(pixels: Array, centroids: Centroids, note: str) -> Iterator[Retry]:
     """The halves of a picture as retries; `note` is put before their own notes."""
     middle = (np.array(pixels.shape[::-1]) - 1) / 2
     right, low = (centroids.xy_px > middle).T
@@ -398,7 +398,7 @@ def halves(pixels: NDArray, centroids: Centroids, note: str) -> Iterator[Retry]:
                 yield Retry(note + HALF.format(side), efforts, part, upper_half=True)
 
 
-def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
+def trails(pixels: Array, settings: Settings) -> Iterator[Centroids]:
     """The centroids of star trails, detected along the streak that the picture's binned blobs share.
 
     Noise breaks a long faint trail into pieces. Most blobs then are pieces, and their common streak is too short. The
@@ -417,7 +417,7 @@ def trails(pixels: NDArray, settings: Settings) -> Iterator[Centroids]:
             continue
 
 
-def without_clouds(pixels: NDArray, settings: Settings) -> Centroids:
+def without_clouds(pixels: Array, settings: Settings) -> Centroids:
     """The centroids of a picture from which all that is wider than stars is removed; none if its noise is uniform."""
     noise = estimate_background(to_native(pixels)).noise
     if np.quantile(noise, 0.9) < UNEVEN * np.quantile(noise, 0.1):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
@@ -45,7 +44,7 @@ from skysim.apps.plate_solver.solver import (
 from skysim.core import files, images
 from skysim.core.errors import InputError, printable
 from skysim.core.text import cells_of, column_numbers, read_lines
-from skysim.core.types import Record
+from skysim.core.types import Array, Record
 
 ANNOTATED = ".annotated.png"
 LIST_SUFFIXES = (".csv", ".ecsv")
@@ -63,7 +62,7 @@ class Reading(NamedTuple):
     `flipped`: whether the file's first row is the lowest of these pixels.
     """
 
-    pixels: NDArray
+    pixels: Array
     solver: Solver
     assumption: str = ""
     flipped: bool = False
@@ -89,7 +88,7 @@ class SolvedReading(NamedTuple):
     tried: list[Reading]
 
     @property
-    def pixels(self) -> NDArray:
+    def pixels(self) -> Array:
         """The pixels of the hypothesis."""
         return self.hypothesis.pixels
 
@@ -362,7 +361,7 @@ def load_picture(
     return light
 
 
-def check_image(path: Path, image: NDArray, camera: KnownCamera) -> None:
+def check_image(path: Path, image: Array, camera: KnownCamera) -> None:
     """Check the image's size against the known camera, and for a scene's camera also its channels and bit depth.
 
     Raises

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
@@ -33,7 +32,7 @@ from skysim.apps.plate_solver.solver import KnownCamera
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.errors import InputError
 from skysim.core.images import ASSUMED_TOP_DOWN, ViewedImage
-from skysim.core.types import Floats, Record, frozen
+from skysim.core.types import Array, Floats, Record, frozen
 
 if TYPE_CHECKING:
     from estimator.trackers.dome_tracker import DomeTracker
@@ -108,7 +107,7 @@ class PlateSolution:
     hint: str = ""
 
 
-def picture_fields(report: Report, pixels: NDArray) -> Record:
+def picture_fields(report: Report, pixels: Array) -> Record:
     """The status, the number of lights and the image statistics of a picture, solved or not."""
     return {
         "status": report.attitude.status,
@@ -423,7 +422,7 @@ class DomeReading(NamedTuple):
     """
 
     solver: DomeSolver
-    pixels: NDArray
+    pixels: Array
     report: Report
     assumption: str = ""
     rows_known: bool = True

@@ -26,7 +26,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.catalog import catalog as star_catalog
 from estimator.core.camera import Camera
@@ -39,10 +38,10 @@ from estimator.identification.refusals import NO_MATCH
 from estimator.trackers.pipeline import Clock, Report, Settings, detect_and_centroid
 from estimator.trackers.search_models import QUAD_SEARCHES
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import InputError, check_name
+from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
-from skysim.core.types import Bools, frozen
+from skysim.core.types import Array, Bools, frozen
 
 if TYPE_CHECKING:
     from skysim.scene.sections.camera import DetectorConfig
@@ -374,12 +373,10 @@ def read_catalog(name: str | None) -> star_catalog.StarCatalog:
         from skysim.tracking.onboard_model import onboard_catalog
 
         return onboard_catalog("solve.catalog", name)
-    try:
+    with refusing(
+        ImageError, "solve.catalog", allowed="a star catalog (.ecsv) built by skysim"
+    ):
         return star_catalog.read(CATALOG)
-    except ImageError as error:
-        raise InputError(
-            "solve.catalog", error, "a star catalog (.ecsv) built by skysim"
-        ) from None
 
 
 def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
@@ -391,7 +388,7 @@ def validated_date(date_utc: datetime | None) -> tuple[datetime | None, str]:
 
 
 def solve_array(
-    image: NDArray,
+    image: Array,
     solver: Solver,
     centroids: Centroids | None = None,
     efforts: int | None = None,

@@ -18,13 +18,12 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft, ndimage, special
 from scipy.interpolate import RectBivariateSpline
 
 from skysim.camera.glow.background import PointedCamera, unproject
 from skysim.camera.optics import Optics
-from skysim.core.types import UP, Floats, SourceTruth, grid_points, lengths, positive
+from skysim.core.types import UP, Array, Floats, SourceTruth, grid_points, lengths, positive
 from skysim.scene.sections.camera import DiskPsfConfig, GhostConfig, GlareConfig
 from skysim.sources.dome.interreflection import DiffuseLight, ReflectingDome
 from skysim.sources.satellites import GHOST
@@ -59,7 +58,7 @@ def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
 BLOCKS = 8
 
 
-def add_glare(light_e: NDArray, config: GlareConfig) -> None:
+def add_glare(light_e: Array, config: GlareConfig) -> None:
     """Scatter the fraction `share` of the light of an (H, W) frame by the glare-spread function, in place.
 
     Polished surfaces scatter by the law of Harvey and Shack, BSDF = b (1 + (sin(theta) / l)^2)^(s / 2), the ABg law

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 
 from skysim.core.errors import InputError
 from skysim.core.text import cells_of, read_lines, to_numbers
-from skysim.core.types import Floats, lengths
+from skysim.core.types import Array, Floats, lengths
 from skysim.core.yaml_reader import is_file
 from skysim.scene.sections.camera import (
     AiryPsfConfig,
@@ -29,7 +28,7 @@ from skysim.scene.sections.camera import (
     MoffatPsfConfig,
 )
 
-Otf = NDArray  # real, or complex where the PSF is not symmetric
+Otf = Array  # real, or complex where the PSF is not symmetric
 
 COMA_NODES = 32  # of the integral over the pupil's area
 WING_LEVEL = 1e-5  # power-law wings are cut where they fall below this fraction of the peak

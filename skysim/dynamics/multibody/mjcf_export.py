@@ -15,13 +15,13 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.types import (
     UP,
+    Array,
     Floats,
     Ints,
     Mount,
@@ -162,7 +162,7 @@ def inline_meshes(spec: Any, model: Any) -> None:
         mesh.userface = faces.ravel()
 
 
-def mesh_arrays(model: Any, k: int) -> tuple[Floats, NDArray[np.int32]]:
+def mesh_arrays(model: Any, k: int) -> tuple[Floats, Array[np.int32]]:
     """(N, 3) vertices and (M, 3) faces of mesh k of a compiled model."""
     vertices = slice(model.mesh_vertadr[k], model.mesh_vertadr[k] + model.mesh_vertnum[k])
     faces = slice(model.mesh_faceadr[k], model.mesh_faceadr[k] + model.mesh_facenum[k])

@@ -14,15 +14,14 @@ from typing import IO
 import cv2
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError, unknown_name
 from skysim.core.files import atomic_file
 from skysim.core.guarded import GL_OFF, PYTHON
-from skysim.core.types import Floats
+from skysim.core.types import Array, Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
 
-Picture = NDArray[np.uint8]
+Picture = Array[np.uint8]
 
 LAB_CAMERA = "lab"  # camera of the MJCF that sees the whole laboratory
 # Width and height.

@@ -4,9 +4,8 @@ from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from numpy.typing import NDArray
 
-from skysim.core.types import Floats
+from skysim.core.types import Array, Floats
 from skysim.dynamics.multibody.mjcf import mujoco_warnings
 from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN, mesh_arrays
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
@@ -54,7 +53,7 @@ class Shape(NamedTuple):
     rgba: tuple[float, ...]
     on_vehicle: bool
     vertices_m: Floats
-    faces: NDArray[np.int32]
+    faces: Array[np.int32]
 
 
 class Laboratory:
@@ -119,7 +118,7 @@ def color(model: mujoco.MjModel, n: int) -> Floats:
     )
 
 
-def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, NDArray[np.int32]]:
+def mesh(model: mujoco.MjModel, n: int) -> tuple[Floats, Array[np.int32]]:
     """Vertices (N, 3) and faces (M, 3) of the mesh of a geom; empty for other kinds."""
     if model.geom_type[n] != mujoco.mjtGeom.mjGEOM_MESH:
         return np.empty((0, 3)), np.empty((0, 3), np.int32)

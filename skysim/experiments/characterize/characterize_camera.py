@@ -10,7 +10,7 @@ import numpy as np
 
 from skysim.core import files
 from skysim.core.errors import InputError, printable
-from skysim.core.types import Record, joined, lengths, taken
+from skysim.core.types import Record, joined, lengths, median, taken
 from skysim.experiments.characterize import frame_files, night_sky, sensor_fit
 from skysim.experiments.characterize.fixed_pattern import DarkCurrent
 from skysim.experiments.characterize.night_sky import LENS, Night, lens_estimates
@@ -335,7 +335,7 @@ def measure_sensor(
     flats = frame_files.read_stack(flats_folder, shape, bits)
     usable = sensor_fit.usable_pixels(darks)
     shortest = min(darks, key=lambda one: one.exposure_s)
-    black_dn = float(np.median(shortest.mean_dn))
+    black_dn = median(shortest.mean_dn)
     frame_files.check_flats(flats_folder, flats, usable, black_dn)
     return sensor_fit.characterize(darks, flats)
 

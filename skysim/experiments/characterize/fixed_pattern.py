@@ -20,7 +20,7 @@ import numpy as np
 from numpy.polynomial import polynomial
 from scipy import special
 
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, median
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
     Estimate,
@@ -84,9 +84,9 @@ def own_variance(rates: Floats, noise: RateNoise) -> tuple[float, float]:
     It is that of the pixels within CORE standard deviations c, where a normal law has the variance
     1 - 2 c phi(c) / (2 Phi(c) - 1). The median of the deviations alone is wrong by a step of the digital numbers.
     """
-    median, spread = median_and_spread(rates)
-    expected = noise.reading + noise.counting * max(median, 0.0)
-    core = rates[np.abs(rates - median) <= CORE * spread]
+    middle, spread = median_and_spread(rates)
+    expected = noise.reading + noise.counting * max(middle, 0.0)
+    core = rates[np.abs(rates - middle) <= CORE * spread]
     variance = float(core.var(dtype=np.float64)) / CORE_VARIANCE
     return variance - expected, CORE_COST * expected * math.sqrt(2 / rates.size)
 
@@ -94,7 +94,7 @@ def own_variance(rates: Floats, noise: RateNoise) -> tuple[float, float]:
 def is_resolved(rates: Floats, noise: RateNoise) -> bool:
     """Whether there is dark current, and it scatters over the pixels by more than the noise, by RESOLVED sigmas."""
     variance, sigma = own_variance(rates, noise)
-    return float(np.median(rates)) > 0 and variance > RESOLVED * sigma
+    return median(rates) > 0 and variance > RESOLVED * sigma
 
 
 def fit(rates: Floats, noise: RateNoise, greatest: float) -> DarkCurrent:
@@ -220,8 +220,8 @@ def maximize(
 
 def core_values(rates: Floats, noise: RateNoise) -> tuple[float, float, float, float]:
     """Mean and DSNU of the core from robust moments, the rate above which pixels are hot, and the robust deviation."""
-    median, spread = median_and_spread(rates)
-    core = max(median, 1e-3 * spread, 1e-12)
+    middle, spread = median_and_spread(rates)
+    core = max(middle, 1e-3 * spread, 1e-12)
     own = max(spread**2 - noise.reading - noise.counting * core, (0.02 * spread) ** 2)
     dsnu = min(math.sqrt(own) / core, 2.0)
     width = math.sqrt(math.log1p(dsnu**2))

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage, special
 
 from skysim.camera import detector
@@ -21,7 +20,7 @@ from skysim.core.errors import InputError
 from skysim.core.files import atomic_file, make_folder
 from skysim.core.random_streams import random_stream
 from skysim.core.text import read_named_rows
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Array, Bools, Floats, median
 from skysim.experiments.characterize.photon_transfer import (
     FIT_RANGE,
     Level,
@@ -31,7 +30,7 @@ from skysim.experiments.characterize.photon_transfer import (
 )
 from skysim.scene.sections.camera import CameraConfig, DetectorConfig
 
-Numbers = NDArray[np.uint16]  # (H, W) digital numbers of a frame
+Numbers = Array[np.uint16]  # (H, W) digital numbers of a frame
 TABLE = "frames.csv"
 UNITS_S = {"us": 1e-6, "ms": 1e-3, "s": 1.0}
 EXPOSURE = re.compile(r"(?:^|[_\- ])(\d+(?:\.\d+)?)(us|ms|s)(?=$|[_\- ])")
@@ -147,7 +146,7 @@ def read_stack(folder: Path, shape: tuple[int, int], bits: int) -> list[Level]:
             )
         level = levels.setdefault(setting, Level(*setting))
         level.add(numbers)
-        level.medians.append((float(np.median(numbers)), path))
+        level.medians.append((median(numbers), path))
     found = list(levels.values())
     check_settings(found)
     found.sort(key=lambda one: (one.exposure_s, one.temperature_c or 0.0))
@@ -294,8 +293,8 @@ POLYPLETS = 110
 def check_darks(folder: Path, darks: Sequence[Level]) -> None:
     """Raise InputError unless these are darks of two exposures or more, with equal medians, no structure, no stars."""
     for level in darks:
-        noise_dn = math.sqrt(float(np.median(level.variance_dn2)) + 1)
-        middle = float(np.median([median for median, _ in level.medians]))
+        noise_dn = math.sqrt(median(level.variance_dn2) + 1)
+        middle = median([one for one, _ in level.medians])
         worst, path = max(level.medians)
         if worst - middle > max(MEDIAN_SIGMAS * noise_dn, 1.0):
             raise InputError(

@@ -3,10 +3,9 @@
 import datetime
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial import cKDTree
 
@@ -19,8 +18,8 @@ from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
 from estimator.trackers.star_tracker import StarTracker
 from skysim.core import images
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.errors import InputError
-from skysim.core.types import Floats, joined, taken
+from skysim.core.errors import InputError, refusing
+from skysim.core.types import Array, Floats, joined, median, taken
 from skysim.experiments.characterize.frame_files import image_files, padding_bits, raw_numbers
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -213,7 +212,7 @@ def image_size(
         pull = (stars.variance_px2 - expected) / (relative * expected)
         again = sound & (
             np.abs(pull)
-            < OUTLIER_SIGMAS * max(1.0, float(np.median(np.abs(pull[kept]))) / MAD_PER_SIGMA)
+            < OUTLIER_SIGMAS * max(1.0, median(np.abs(pull[kept])) / MAD_PER_SIGMA)
         )
         is_settled = np.array_equal(again, kept) and np.allclose(
             error, relative * expected, rtol=SETTLED
@@ -329,10 +328,8 @@ def read_frame(
         numbers = np.ascontiguousarray(numbers[::-1])
     images.check_size(path, numbers, (config.height_px, config.width_px))
     numbers = np.right_shift(numbers, np.uint16(padding_bits(numbers, config.detector.bits)))
-    try:
+    with refusing(ImageError, path):
         centroids = detect_and_centroid(numbers, calibration(config), settings, Clock())
-    except ImageError as error:
-        raise InputError(path, error) from None
     signal = transfer.linear_dn(numbers - transfer.values[BLACK])
     chosen = measurable(numbers, centroids, transfer, settings.saturation)
     gain, _, read = transfer.values[: READ + 1].tolist()
@@ -346,7 +343,7 @@ def read_frame(
 
 
 def measurable(
-    numbers: NDArray[Any], centroids: Centroids, transfer: Transfer, saturation_dn: float
+    numbers: Array, centroids: Centroids, transfer: Transfer, saturation_dn: float
 ) -> Floats:
     """(N, 2) pixels of stars that are bright, not saturated, and away from the border and from other stars."""
     xy = centroids.xy_px
@@ -354,7 +351,7 @@ def measurable(
     inside = np.all((xy >= HALF_PX) & (xy <= last - HALF_PX), axis=1)
     near = cKDTree(xy).query(xy, k=2)[0][:, 1]
     x, y = np.clip(np.rint(xy).astype(int), 0, last).T
-    background = float(np.median(numbers))
+    background = median(numbers)
     gain, _, read, black = transfer.values[: BLACK + 1]
     dark_e2 = (background - black) / gain + read / gain**2
     flux_e = centroids.flux / gain
@@ -386,7 +383,7 @@ def check_trails(frames: list[NightFrame]) -> None:
             continue
         along, across = np.median(one.stars.stretch_px2, axis=0).tolist()
         stretch = math.hypot(along, across)
-        variance = float(np.median(one.stars.variance_px2))
+        variance = median(one.stars.variance_px2)
         if stretch > MAX_STRETCH * variance:
             # A uniform streak of length L has the variance L^2 / 12.
             trail_px = math.sqrt(12 * stretch)

@@ -26,12 +26,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.optimize import brentq, least_squares
 
 from skysim.core.constants import MAD_PER_SIGMA
-from skysim.core.types import Bools, Floats, Ints, Singles
+from skysim.core.types import Array, Bools, Floats, Ints, Singles, median
 from skysim.results.metrics import SIGMAS, TAILS
 
 # A measured number with its interval.
@@ -115,11 +114,11 @@ def propagate(
 
 def median_and_spread(values: Floats) -> tuple[float, float]:
     """Median and robust standard deviation."""
-    median = float(np.median(values))
-    return median, float(np.median(np.abs(values - median))) / MAD_PER_SIGMA
+    middle = median(values)
+    return middle, median(np.abs(values - middle)) / MAD_PER_SIGMA
 
 
-def blocks(image: NDArray, side: int) -> NDArray:
+def blocks(image: Array, side: int) -> Array:
     """(rows, side, columns, side) square blocks of an image; incomplete ones at the right and below are cut off."""
     rows, columns = (size // side for size in image.shape)
     return image[: rows * side, : columns * side].reshape(rows, side, columns, side)
@@ -180,11 +179,11 @@ class Level:
     medians: list[tuple[float, Path]] = field(default_factory=list)
     pairs: int = 0
     greatest_dn: int = 0
-    first: NDArray | None = None
+    first: Array | None = None
     sums: Any = 0
     square_dn2: float = 0.0
 
-    def add(self, frame: NDArray) -> None:
+    def add(self, frame: Array) -> None:
         """Add a frame of digital numbers; every second one completes a pair, and an odd last one is left out."""
         if self.first is None:
             self.first = frame

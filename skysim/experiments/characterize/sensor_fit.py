@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from skysim.core.types import Bools, Floats, joined, taken
+from skysim.core.types import Bools, Floats, joined, median, taken
 from skysim.experiments.characterize import fixed_pattern, photon_transfer
 from skysim.experiments.characterize.photon_transfer import (
     BLACK,
@@ -135,9 +135,9 @@ def usable_pixels(darks: Levels) -> Bools:
     usable = np.ones(darks[0].mean_dn.shape, bool)
     for one in darks:
         mean = one.mean_dn
-        median, spread = median_and_spread(mean)
-        usable &= (mean < median + HOT_SIGMAS * max(spread, 0.5)) & steady_pixels(
-            one, float(np.median(one.variance_dn2))
+        middle, spread = median_and_spread(mean)
+        usable &= (mean < middle + HOT_SIGMAS * max(spread, 0.5)) & steady_pixels(
+            one, median(one.variance_dn2)
         )
     return usable
 
@@ -282,7 +282,7 @@ def unresolved(
         lambda p: p[FIRST_DARK + own] / p[GAIN], transfer.values, transfer.covariance
     )
     found.estimates["dark_e_s"] = dark
-    mean = float(np.median(rates))
+    mean = median(rates)
     if mean > 0 and mean**2 > noise.reading:
         variance, error = fixed_pattern.own_variance(rates, noise)
         found.estimates["dsnu"] = Estimate.root(variance / mean**2, error / mean**2)

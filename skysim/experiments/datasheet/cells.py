@@ -13,13 +13,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from skysim.camera import as_built
 from skysim.core.constants import DAY_S, HOUR_S
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_within
 from skysim.core.files import make_folder, write_text
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import Array, Bools, Floats, Record
 from skysim.core.yaml_reader import OverrideTexts, parse_yaml
 from skysim.experiments.datasheet import scene_changes
 from skysim.experiments.study.execution import runner, store
@@ -375,7 +374,7 @@ class MeasuredFrames(NamedTuple):
     size: Size
     designer: Designer
     cells: list[DatasheetCell]
-    columns: dict[str, NDArray[Any]]
+    columns: dict[str, Array]
     spec: TrialSpec
 
     def rows(self, experiment: str, **levels: Any) -> CellRows:
@@ -518,14 +517,12 @@ def planned(
     write_text(path, text)
     plan = make_plan(path, Study.model_validate(tree), tree["trial"], {}, text)
     for cell in cells:
-        try:
+        with errors_within(cell.name):
             resolve_point(plan.spec, cell.settings)
-        except InputError as error:
-            raise error.within(cell.name) from None
     return plan
 
 
-def read(plan: Plan, kept: store.Store) -> dict[str, NDArray[Any]]:
+def read(plan: Plan, kept: store.Store) -> dict[str, Array]:
     """The columns of all trials, (cells, fields). Raises InputError for a failed trial."""
     if failures := kept.failures():
         trial, error = failures[0]

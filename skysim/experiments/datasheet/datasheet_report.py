@@ -274,7 +274,7 @@ def numbers(statement: Statement) -> Record:
         "fields": sheet.size.fields,
         "units": sheet.designer.units,
         "states_c": sheet.designer.temperatures_c,
-        "frames": int(sheet.columns["trial"].size),
+        "frames": sheet.columns["trial"].size,
         "fields_solved": statement.fields,
         "limits": limits(statement),
     }

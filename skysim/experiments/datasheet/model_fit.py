@@ -45,19 +45,19 @@ def constants(sheet: MeasuredFrames) -> Record:
     noise = np.sqrt(np.maximum(squares - slow, LEAST_NOISE * squares))
     return {
         "scene": sheet.scene.name,
-        "axes": list(AXES),
-        "mean": errors.mean(axis=(1, 2, 3, 4, 5)).tolist(),
-        "unit": unit_scatter(errors).tolist(),
-        "thermal": thermal.tolist(),
-        "field": field.tolist(),
-        "pixel": pixel.tolist(),
+        "axes": AXES,
+        "mean": errors.mean(axis=(1, 2, 3, 4, 5)),
+        "unit": unit_scatter(errors),
+        "thermal": thermal,
+        "field": field,
+        "pixel": pixel,
         "scale": [across, across, about],
         "field_deg": field_angle_deg(sheet, field, pixel, mean),
         "pixel_deg": sheet.designer.pixel_deg,
         "scale_deg": half_field_deg(sheet.scene),
         "rates_deg_s": list(by_rate),
-        "noise": [rest.tolist(), *noise[1:].tolist()],
-        "along": np.sqrt(along).tolist(),
+        "noise": [rest, *noise[1:]],
+        "along": np.sqrt(along),
     }
 
 
@@ -265,8 +265,8 @@ def agreements(sheet: MeasuredFrames) -> list[Agreement]:
 def of_one_unit(sheet: MeasuredFrames) -> ErrorModel:
     """The model of a sheet for the first of its units in its first thermal state."""
     none = [0.0, 0.0, 0.0]
-    mean = unit_mean(sheet).tolist()
-    return ErrorModel(constants(sheet) | {"mean": mean, "unit": none, "thermal": none})
+    own = {"mean": unit_mean(sheet), "unit": none, "thermal": none}
+    return ErrorModel(constants(sheet) | own)
 
 
 def agreement(

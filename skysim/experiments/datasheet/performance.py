@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtri
 
-from skysim.core.types import Floats, Record
+from skysim.core.types import Floats, Record, median
 from skysim.experiments.datasheet.cells import CellRows, MeasuredFrames
 from skysim.experiments.datasheet.variance_components import (
     GROUPS,
@@ -322,7 +322,7 @@ def timing(sheet: MeasuredFrames, times_s: list[float]) -> Record:
     parts_s = {
         "half_exposure_s": scene.exposure.time_s / 2,
         "readout_s": row_s * scene.camera.height_px,
-        "solution_s": float(np.median(times_s)),
+        "solution_s": median(times_s),
     }
     return {
         "rate_hz": scene.exposure.rate_hz,

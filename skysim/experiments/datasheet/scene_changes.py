@@ -1,7 +1,6 @@
 """Changes of a scene that a datasheet measures: what would lower the error, and disturbances."""
 
 import math
-from typing import Any
 
 from skysim.experiments.study.factors import Settings
 from skysim.scene.scene import BODIES_YEARS, Scene
@@ -104,7 +103,7 @@ def disturbances(scene: Scene) -> Changes:
 
 def beside(body: str, least_deg: float, greatest_deg: float) -> Settings:
     """Settings of attitudes at angles from a body that shines."""
-    near: dict[str, Any] = {"body": body, "off_deg": [least_deg, greatest_deg]}
+    near: Settings = {"body": body, "off_deg": [least_deg, greatest_deg]}
     return {"trial.near": near, "light.bodies": {}}
 
 

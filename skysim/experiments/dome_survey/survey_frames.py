@@ -1,10 +1,9 @@
 """Frames of a survey: the model that is assumed before it, the lights of each frame, and which LEDs they are."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
@@ -21,6 +20,7 @@ from skysim.core.constants import MAD_PER_SIGMA
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.types import (
+    Array,
     Bools,
     Floats,
     Frame,
@@ -428,7 +428,7 @@ def imu_attitudes(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Ro
     return Rotation.from_rotvec(error_rad) * lab_from_body.inv()
 
 
-def detect_lights(settings: Settings, camera: Camera, image_dn: NDArray[Any]) -> Centroids:
+def detect_lights(settings: Settings, camera: Camera, image_dn: Array) -> Centroids:
     """Centroids of an image; none if the tracker would reject it."""
     try:
         return detect_and_centroid(image_dn, camera, settings, Clock())

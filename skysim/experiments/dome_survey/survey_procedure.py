@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever
@@ -27,7 +26,7 @@ from skysim.core import files, images
 from skysim.core.errors import InputError
 from skysim.core.random_streams import random_stream
 from skysim.core.text import excerpt, read_named_rows
-from skysim.core.types import Bools, Record
+from skysim.core.types import Array, Bools, Record
 from skysim.experiments.dome_survey.adjust import run_survey
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
@@ -123,7 +122,7 @@ def lights_of(path: Path, camera: Camera, settings: Settings) -> Centroids:
     return detect_lights(settings, camera, pixels_of(path, camera))
 
 
-def pixels_of(path: Path, camera: Camera) -> NDArray:
+def pixels_of(path: Path, camera: Camera) -> Array:
     """The pixels of an image of the camera, the highest row first. Raises InputError for another size."""
     pixels = images.as_light(images.read_ordered(path)).pixels
     images.check_size(path, pixels, (camera.height_px, camera.width_px))

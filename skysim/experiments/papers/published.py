@@ -4,12 +4,12 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.units import ConfigModel, NotNegative, Number, PositiveInt, ZeroOrMore
-from skysim.core.yaml_reader import explain, read_yaml
+from skysim.core.yaml_reader import explained, read_yaml
 
 FOLDER = DATA / "published"
 
@@ -125,7 +125,5 @@ def experiments() -> dict[str, Experiment]:
 def read(path: Path) -> Paper:
     """Read one file of data/published. Raises InputError."""
     tree, text = read_yaml(path)
-    try:
+    with explained(tree, [(path, text)], {}):
         return Paper.model_validate(tree)
-    except ValidationError as error:
-        raise explain(error, tree, [(path, text)], {}) from error

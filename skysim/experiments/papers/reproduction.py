@@ -255,7 +255,7 @@ def at_path(result: Any, path: str) -> float:
     for part in path.split("."):
         if result is None:  # of a frame without a solution
             return math.nan
-        result = result[int(part)] if isinstance(result, list | tuple) else result[part]
+        result = result[part] if isinstance(result, dict) else result[int(part)]
     return float(result)
 
 

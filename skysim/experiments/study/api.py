@@ -24,6 +24,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, write_text
 from skysim.core.plugins import NO_PROGRAMS, Programs
+from skysim.core.types import Record
 from skysim.core.yaml_reader import (
     MAPPING,
     Keys,
@@ -193,7 +194,7 @@ def keys_of(study: Any, path: Path) -> Keys:
     return {"title": loaded.title, "seed": loaded.seed, "scene": study}
 
 
-def with_names(value: Any, programs: dict[str, Any]) -> Any:
+def with_names(value: Any, programs: Record) -> Any:
     """A value of a study or a scene with names for functions and trackers in it, which are added to `programs`.
 
     Raises InputError for two with one name, and for the name of one of skysim's own.
@@ -207,7 +208,7 @@ def with_names(value: Any, programs: dict[str, Any]) -> Any:
     return register(name_of(value), value, programs)
 
 
-def register(name: str, part: Any, programs: dict[str, Any]) -> str:
+def register(name: str, part: Any, programs: Record) -> str:
     """Add a tracker or controller to the programs, and return its name. Raises InputError if that is in use."""
     if programs.setdefault(name, part) is not part or name in (OWN, *CONTROLLERS.own):
         raise InputError(name, "name already in use", f"a mapping such as {{'my_{name}': …}}")
@@ -226,9 +227,7 @@ def slug(tree: Tree) -> str:
     return re.sub(r"\W+", "_", str(tree.get("title", ""))).strip("_").lower() or "study"
 
 
-def with_part(
-    tree: Tree, name: str, given: Any, folder: Path, programs: dict[str, Any]
-) -> None:
+def with_part(tree: Tree, name: str, given: Any, folder: Path, programs: Record) -> None:
     """Put a controller, tracker or profile into a study's keys; several become levels of a factor of its name."""
     many = isinstance(given, list | tuple) or (
         isinstance(given, Mapping) and not set(profile_samples.TIMES) & set(given)

@@ -20,7 +20,7 @@ from pydantic import Discriminator, Field, Tag
 
 from skysim.core.errors import InputError
 from skysim.core.types import Floats
-from skysim.core.units import ConfigModel, NotEmpty
+from skysim.core.units import ConfigModel, NotEmpty, within
 
 Value = Any  # value of a key: any YAML value
 Settings = dict[str, Value]  # dotted keys of the scene, or of `trial.`, to values
@@ -110,7 +110,7 @@ class Range(KeyedFactor):
 
     from_: Annotated[Value, Field(alias="from")]
     to: Value
-    steps: Annotated[int, Field(ge=2, le=MAX_LEVELS)] = 5
+    steps: Annotated[int, within(2, MAX_LEVELS)] = 5
     scale: Literal["linear", "log"] = "linear"
     integer: bool = False
 
@@ -279,7 +279,7 @@ class Design(ConfigModel):
     """
 
     kind: Literal["factorial", "one_at_a_time", "lhs", "sobol", "saltelli"] = "factorial"
-    points: Annotated[int, Field(ge=2, le=MAX_POINTS)] | None = None
+    points: Annotated[int, within(2, MAX_POINTS)] | None = None
 
 
 Factors = Mapping[str, Factor]

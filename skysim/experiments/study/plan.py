@@ -14,7 +14,6 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    ValidationError,
     model_validator,
 )
 
@@ -37,8 +36,9 @@ from skysim.core.units import (
     Seed,
     Signed,
     Three,
+    within,
 )
-from skysim.core.yaml_reader import Tree, explain, is_file, one_line, set_key
+from skysim.core.yaml_reader import Tree, explained, is_file, one_line, set_key
 from skysim.experiments.study.factors import (
     MAX_LEVELS,
     SAMPLED_DESIGNS,
@@ -55,7 +55,7 @@ from skysim.scene.scene import Requirements, Scene
 TRIAL = "trial."
 HARDWARE = 1  # first of the three numbers of a hardware seed's key; a trial's seed has one or two (`trials.seed_of`)
 SeedKey = Annotated[str, Field(pattern=r"^[a-z_]+(\.\w+)*[._]seed$")]
-Tilt = Annotated[Number, Field(ge=0, le=90)]
+Tilt = Annotated[Number, within(0, 90)]
 BodyName = Literal[
     "zenith",
     "sun",
@@ -183,8 +183,8 @@ class CentroidTrial(RandomAttitude):
     magnitude_sigma: NotNegative = 0.25
     lights: PositiveInt | None = None
     missing: Fraction = 0.0
-    false_lights: Annotated[int, Field(ge=0, le=10_000)] = 0
-    false_share: Annotated[Number, Field(ge=0, le=0.95)] = 0.0
+    false_lights: Annotated[int, within(0, 10_000)] = 0
+    false_share: Annotated[Number, within(0, 0.95)] = 0.0
 
 
 class FrameTrial(RandomAttitude):
@@ -216,7 +216,7 @@ class FrameTrial(RandomAttitude):
     turn_deg: Signed = 0.0
     rate_axis: RateAxis = "perpendicular"
     gyro: bool = False
-    tracked: Annotated[int, Field(ge=0, le=100)] = 0
+    tracked: Annotated[int, within(0, 100)] = 0
 
 
 def expand_start(value: Any) -> Any:
@@ -391,7 +391,7 @@ class Search(ConfigModel):
 
     objectives: Annotated[tuple[Objective, ...], Field(min_length=1, max_length=2)]
     constraints: tuple[Constraint, ...] = ()
-    candidates: Annotated[int, Field(ge=2, le=100_000)] = 60
+    candidates: Annotated[int, within(2, 100_000)] = 60
     cost: Cost = Cost()
 
     @property
@@ -427,7 +427,7 @@ class Study(ConfigModel):
 
     schema_version: Annotated[Literal[1], Field(alias="schema")]
     title: str
-    scene: str | dict[str, Any]
+    scene: str | Tree
     seed: Seed
     set: Settings = Field(default_factory=dict)
     trial: Trial
@@ -435,7 +435,7 @@ class Study(ConfigModel):
         default_factory=dict, max_length=100
     )
     design: Design = Design()
-    replicates: Annotated[int, Field(ge=1, le=10_000_000)] = 1
+    replicates: Annotated[int, within(1, 10_000_000)] = 1
     hardware: tuple[SeedKey, ...] = ()
     paired: bool = True
     responses: NotEmpty[str]
@@ -496,7 +496,7 @@ class TrialSpec:
         Digests of these functions and objects
     """
 
-    scene: str | dict[str, Any]
+    scene: str | Tree
     folder: str
     seed: int
     base: Settings
@@ -602,11 +602,9 @@ def resolve_trial(spec: TrialSpec, settings: Settings) -> Trial:
     for key, value in (spec.base | settings).items():
         if key.startswith(TRIAL):
             set_key(tree, key, one_line(value))
-    try:
+    # Errors without file and line number; the caller adds the factor.
+    with explained(tree, [], {}):
         return TrialSection.model_validate(tree).trial
-    except ValidationError as error:
-        # One line without file and line number; the caller adds the factor.
-        raise explain(error, tree, [(Path(), "")], {}).at(None) from None
 
 
 class TrialSection(ConfigModel):

@@ -5,18 +5,17 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from pydantic import ValidationError
 
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.star_tracker import StarTracker
-from skysim.core.errors import OVERRIDES, InputError, check_name
+from skysim.core.errors import OVERRIDES, InputError, check_name, errors_under, errors_within
 from skysim.core.paths import STUDIES
 from skysim.core.plugins import Programs
 from skysim.core.yaml_reader import (
     OverrideTexts,
     Tree,
     check_version,
-    explain,
+    explained,
     find_file,
     read_yaml,
     set_key,
@@ -117,10 +116,8 @@ def plan_of(
     InputError
         With one line.
     """
-    try:
+    with explained(tree, [(path, text)], overrides or {}):
         study = Study.model_validate(tree)
-    except ValidationError as error:
-        raise explain(error, tree, [(path, text)], overrides or {}) from None
     try:
         plan = make_plan(base or path, study, tree["trial"], programs or {}, text)
         check(plan, to_run=programs is not None)
@@ -153,10 +150,8 @@ def make_plan(path: Path, study: Study, trial: Tree, programs: Programs, text: s
         chosen = points(study.design, study.factors, study.seed)
         return Plan(path, study, spec, chosen, text=text)
     parts = study.optimize.cost.parts
-    try:
+    with errors_within("optimize.cost.parts"):
         prices = read_prices(find_prices(parts, folder)) if parts else None
-    except InputError as error:
-        raise error.within("optimize.cost.parts") from None
     return Plan(path, study, spec, [], prices, text)
 
 
@@ -230,10 +225,8 @@ def check_figures(plan: Plan) -> None:
         if isinstance(one, Threshold):
             thresholds.check(one, where, lines)
         if plan.points:
-            try:
+            with errors_under(where):
                 lines.fixed_levels(one)
-            except InputError as error:
-                raise error.under(where) from None
 
 
 def named_sections(study: Study) -> Iterator[tuple[str, Figure | Threshold]]:

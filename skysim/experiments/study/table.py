@@ -14,7 +14,7 @@ import scipy
 
 from skysim.core.errors import InputError, check_name
 from skysim.core.random_streams import random_stream
-from skysim.core.types import Bools, Floats, Record
+from skysim.core.types import Array, Bools, Floats, Record
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.factors import (
     Distribution,
@@ -27,7 +27,7 @@ from skysim.experiments.study.factors import (
 )
 from skysim.experiments.study.plan import Figure, Plan, Study, Threshold
 from skysim.results import metrics
-from skysim.results.files.row_parts import Array, Rows, subset
+from skysim.results.files.row_parts import Rows, subset
 from skysim.results.metrics import Columns, Summary
 
 LONG_QUANTITY = re.compile(r"(-?\d*\.\d{4,}(?:e[-+]?\d+)?)(\s\S.*)$")

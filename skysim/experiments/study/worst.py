@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from skysim.core.types import Floats, Ints, positive
+from skysim.core.types import Array, Floats, Ints, positive
 from skysim.experiments.study.execution.store import Store
 from skysim.experiments.study.plan import Study
 from skysim.experiments.study.table import without_responses
-from skysim.results.files.row_parts import Array, row_of, subset
+from skysim.results.files.row_parts import row_of, subset
 from skysim.results.metrics import (
     COVERAGE,
     MORE_IS_BETTER,

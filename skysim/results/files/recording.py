@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.camera import wcs
@@ -23,14 +22,14 @@ from skysim.core.files import (
     write_table,
 )
 from skysim.core.images import TOP_DOWN_CARD, read_image
-from skysim.core.types import ATTITUDES, Floats, Frame, Record, Truth
+from skysim.core.types import ATTITUDES, Array, Floats, Frame, Record, Truth
 from skysim.dynamics.profile_samples import BODY_ANGLES, CAMERA_ANGLES
 from skysim.scene.scene import Scene
 from skysim.sources import stars
 
 STARS = "ICRS axes"  # value of `lab` in a truth header for a scene under the stars
 UNIT_NORM = 1e-6
-Attitudes = tuple[NDArray[Any], Rotation] | None  # (K,) frames or times, and their attitudes
+Attitudes = tuple[Array, Rotation] | None  # (K,) frames or times, and their attitudes
 
 
 class FrameTruth(NamedTuple):
@@ -94,7 +93,7 @@ class Recording:
         """The truth of every frame."""
         return (read_truth(stem.with_suffix(".ecsv")) for stem in self.stems)
 
-    def image(self, stem: Path) -> NDArray[Any]:
+    def image(self, stem: Path) -> Array:
         """A frame's digital numbers: (H, W) uint16, or float64 from a noise-free camera. Raises InputError."""
         image = read_image(stem.with_suffix(".fits"))
         if image.ndim != 2 or not image.size:

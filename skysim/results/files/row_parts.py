@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
 from skysim.core.files import atomic_file
+from skysim.core.types import Array, Record
 
 EXTRA = "needs optional packages: pip install 'skysim[export]'"
 KEPT_BYTES = 250_000_000  # size of the columns kept in memory for further use; the oldest are dropped first
 
-Array = NDArray[Any]
 Columns = Mapping[str, Array]
 Source = Callable[[str], Array]  # the column of some rows by its name
 
@@ -132,7 +131,7 @@ def write_part(path: Path, columns: Columns) -> None:
     sync(path.parent)
 
 
-def encoding(schema: Any) -> dict[str, Any]:
+def encoding(schema: Any) -> Record:
     """Options of the Parquet writer: split bytes for floats, dictionaries for all other columns.
 
     A float's exponent compresses well, its fraction hardly. Grouping all first bytes, all second bytes and so on takes

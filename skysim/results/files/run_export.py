@@ -11,14 +11,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core import files, images
 from skysim.core.encoded import silent_stderr
-from skysim.core.errors import InputError, check_name
+from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.time import in_utc
-from skysim.core.types import ATTITUDES, Record
+from skysim.core.types import ATTITUDES, Array, Record, median
 from skysim.dynamics.profile_samples import BODY, CAMERA, ICRF, LAB, continuous
 from skysim.results import plots
 from skysim.results.files.recording import ZARR, FrameTruth, Recording
@@ -194,7 +193,7 @@ COMPONENTS = {
 }
 
 
-def frame_columns(run: Recording, bar: Bar) -> dict[str, NDArray[Any]]:
+def frame_columns(run: Recording, bar: Bar) -> dict[str, Array]:
     """The truth of all frames by the fields of FrameTruth, (F,) or (F, K) each; times as text."""
     true = [truth._replace(sources=None) for truth in truths(run, bar)]
     utc = [truth.mid_utc.isoformat(timespec="microseconds") for truth in true]
@@ -226,10 +225,8 @@ def to_parquet(run: Recording, out: Path, bar: Bar) -> Paths:
 
     Units are in the field metadata. Raises InputError if pyarrow is not installed.
     """
-    try:
+    with refusing(ImportError, "export.formats", f"parquet {EXTRA}"):
         import pyarrow.parquet
-    except ImportError:
-        raise InputError("export.formats", f"parquet {EXTRA}") from None
     tables = {"truth": truth_table(run, bar)}
     tables |= {
         name: table
@@ -315,10 +312,8 @@ def to_zarr(run: Recording, out: Path, bar: Bar) -> Paths:
     InputError
         If zarr is not installed or the frames differ in size or type.
     """
-    try:
+    with refusing(ImportError, "export.formats", f"zarr {EXTRA}"):
         import zarr
-    except ImportError:
-        raise InputError("export.formats", f"zarr {EXTRA}") from None
     path = out / ZARR
     count = len(run.stems)
     columns = frame_columns(run, bar)
@@ -371,7 +366,7 @@ def to_video(run: Recording, out: Path, bar: Bar) -> Paths:
     path = out / "frames.mp4"
     first = run.image(run.stems[0])
     seconds = [truth.t_mid_s for truth in truths(run, bar)]
-    rate_hz = 1 / float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    rate_hz = 1 / median(np.diff(seconds)) if len(seconds) > 1 else 1.0
     sampled = run.stems[:: max(len(run.stems) // SAMPLED_FRAMES, 1)]
     low, high = np.median([plots.display_levels(run.image(stem)) for stem in sampled], axis=0)
     height, width = (

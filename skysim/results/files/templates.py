@@ -19,12 +19,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core import files
 from skysim.core.constants import INCH_M
 from skysim.core.errors import check_name
-from skysim.core.types import UP, Floats, azimuths_rad, lengths, normalized
+from skysim.core.types import UP, Floats, Ints, azimuths_rad, lengths, normalized
 from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
@@ -275,7 +274,7 @@ def outline(meridian_rad: float, half_rad: float, cap_deg: float) -> Floats:
     return directions(tilt_rad, meridian_rad + aside_rad)
 
 
-def marks(numbers: NDArray[np.int64], xy_mm: Floats, radius_mm: float) -> Iterator[Shape]:
+def marks(numbers: Ints, xy_mm: Floats, radius_mm: float) -> Iterator[Shape]:
     """A circle with a cross for each LED, and its number."""
     for number, (x, y) in zip(numbers, xy_mm, strict=True):
         yield Circle(x, y, radius_mm)

@@ -34,8 +34,10 @@ from skysim.core.units import (
     Signed,
     TableConfig,
     Temperature,
+    above,
     check_table,
     quantity,
+    within,
 )
 from skysim.core.yaml_reader import MAX_BYTES, ExistingFile, read_limited
 from skysim.scene.opencv_calibration import OpencvCalibration
@@ -43,22 +45,22 @@ from skysim.scene.opencv_calibration import OpencvCalibration
 # Type in the JSON schema, which editors show.
 FocusText = Annotated[str, Field(description='a length such as "33 in", or infinity')]
 
-Electrons = Annotated[Number, Field(ge=0, le=1e9)]
+Electrons = Annotated[Number, within(0, 1e9)]
 
-Wavelength = Annotated[Length, Field(ge=200e-9, le=2e-6)]
+Wavelength = Annotated[Length, within(200e-9, 2e-6)]
 
 # Standard deviation of a Gaussian: one that blurs a smooth image more, and one that alone makes it smooth enough.
-Blur = Annotated[Number, Field(ge=0, le=20)]
-SampledBlur = Annotated[Number, Field(ge=0.2, le=20)]
+Blur = Annotated[Number, within(0, 20)]
+SampledBlur = Annotated[Number, within(0.2, 20)]
 
-DiskRadius = Annotated[Number, Field(gt=0, le=200)]
-Side = Annotated[int, Field(ge=16, le=20000)]
-TransferLoss = Annotated[Number, Field(ge=0, le=1e-2)]
+DiskRadius = Annotated[Number, above(0, 200)]
+Side = Annotated[int, within(16, 20000)]
+TransferLoss = Annotated[Number, within(0, 1e-2)]
 
-Radial = Annotated[Number, Field(ge=-1e6, le=1e6)]
+Radial = Annotated[Number, within(-1e6, 1e6)]
 
-Tangential = Annotated[Number, Field(ge=-0.1, le=0.1)]  # a larger value would fold the image
-Column = Several[Annotated[Number, Field(ge=-100, le=100)]] | None
+Tangential = Annotated[Number, within(-0.1, 0.1)]  # a larger value would fold the image
+Column = Several[Annotated[Number, within(-100, 100)]] | None
 Distortion = tuple[Radial, Radial, Tangential, Tangential, Radial]
 
 
@@ -89,7 +91,7 @@ class PsfConfig(ConfigModel):
     """
 
     corner_sigma_px: Blur = 0.0
-    coma_px: Annotated[Number, Field(ge=-20, le=20)] = 0.0
+    coma_px: Annotated[Number, within(-20, 20)] = 0.0
 
 
 class GaussianPsfConfig(PsfConfig):
@@ -103,8 +105,8 @@ class MoffatPsfConfig(PsfConfig):
     """A Moffat profile: a core with power-law wings (Moffat 1969)."""
 
     kind: Literal["moffat"]
-    fwhm_px: Annotated[Number, Field(ge=0.5, le=50)]
-    beta: Annotated[Number, Field(ge=1.5, le=20)] = 3.0
+    fwhm_px: Annotated[Number, within(0.5, 50)]
+    beta: Annotated[Number, within(1.5, 20)] = 3.0
 
 
 class AiryPsfConfig(PsfConfig):
@@ -128,7 +130,7 @@ class MeasuredPsfConfig(PsfConfig):
 
     kind: Literal["measured"]
     file: str
-    oversampling: Annotated[int, Field(ge=1, le=32)] = 1
+    oversampling: Annotated[int, within(1, 32)] = 1
 
 
 Psf = Annotated[
@@ -167,7 +169,7 @@ class ChromaticConfig(ConfigModel):
     """
 
     wavelength_m: Several[Wavelength]
-    focus_m: Several[Annotated[Length, Field(ge=-1e-3, le=1e-3)]] | None = None
+    focus_m: Several[Annotated[Length, within(-1e-3, 1e-3)]] | None = None
     corner_px: Column = None
 
     def check(self) -> None:
@@ -196,7 +198,7 @@ class LensTableConfig(ConfigModel):
         Lateral color over that of chromatic.corner_px
     """
 
-    field_deg: Several[Annotated[Number, Field(ge=0, le=89)]]
+    field_deg: Several[Annotated[Number, within(0, 89)]]
     coma_um: Column = None
     sigma_um: Column = None
     lateral: Column = None
@@ -239,7 +241,7 @@ class GhostConfig(ConfigModel):
         Radius of the disk over which it is spread, out of focus
     """
 
-    magnification: Annotated[Number, Field(ge=-20, le=20)]
+    magnification: Annotated[Number, within(-20, 20)]
     share: AboveZero[Fraction]
     radius_px: DiskRadius
 
@@ -266,8 +268,8 @@ class GlareConfig(ConfigModel):
     """
 
     share: Annotated[Fraction, Field(gt=0, lt=1)]
-    exponent: Annotated[Number, Field(gt=2, le=10)]
-    core_px: Annotated[Number, Field(ge=2, le=1000)]
+    exponent: Annotated[Number, above(2, 10)]
+    core_px: Annotated[Number, within(2, 1000)]
 
 
 class BaffleConfig(TableConfig):
@@ -333,10 +335,10 @@ class ParticlesConfig(ConfigModel):
         Standard deviation of the charge cloud
     """
 
-    per_cm2_s: Annotated[Number, Field(ge=0, le=1e12)]
-    depth_m: Annotated[Length, Field(gt=0, le=1e-3)] = 10e-6
+    per_cm2_s: Annotated[Number, within(0, 1e12)]
+    depth_m: Annotated[Length, above(0, 1e-3)] = 10e-6
     electrons_um: Positive = 80.0
-    diffusion_px: Annotated[Number, Field(ge=0, le=5)] = 0.3
+    diffusion_px: Annotated[Number, within(0, 5)] = 0.3
 
 
 Curve = Annotated[str, AfterValidator(lambda name: curve_file(name) and name)]
@@ -373,7 +375,7 @@ def efficiency_tag(value: Any) -> str:
 
 
 Efficiency = Annotated[
-    Annotated[Annotated[float, Field(gt=0, le=1)], Tag("number")]
+    Annotated[Annotated[float, above(0, 1)], Tag("number")]
     | Annotated[Curve, Tag("name")]
     | Annotated[EfficiencyConfig, Tag("EfficiencyConfig")]
     | Annotated[ColorEfficiencyConfig, Tag("ColorEfficiencyConfig")],
@@ -447,16 +449,16 @@ class DetectorConfig(ConfigModel):
     quantum_efficiency: Efficiency
     bayer: Literal["RGGB", "BGGR", "GRBG", "GBRG"] | None = None
     hardware_seed: Seed = 0
-    prnu: Annotated[Number, Field(ge=0, le=0.2)] = 0.0
+    prnu: Annotated[Number, within(0, 0.2)] = 0.0
     dark_e_s: Electrons = 0.0
     dark_temperature_c: Temperature = 20.0
-    dark_doubling_c: Annotated[Number, Field(ge=1, le=50)] = 7.0
+    dark_doubling_c: Annotated[Number, within(1, 50)] = 7.0
     temperature_c: Temperature | None = None
-    dsnu: Annotated[Number, Field(ge=0, le=2)] = 0.0
+    dsnu: Annotated[Number, within(0, 2)] = 0.0
     hot_pixels: Fraction = 0.0
     hot_e_s: Electrons = 0.0
     particles: tuple[ParticlesConfig, ...] = ()
-    full_well_e: Annotated[Number, Field(ge=1, le=1e9)]
+    full_well_e: Annotated[Number, within(1, 1e9)]
     blooming: Literal["none", "column"] = "none"
     anti_blooming: Fraction = 0.0
     cti_parallel: TransferLoss = 0.0
@@ -464,14 +466,14 @@ class DetectorConfig(ConfigModel):
     read_noise_e: Electrons = 0.0
     reset_noise_e: Electrons = 0.0
     column_offset_e: Electrons = 0.0
-    gain_e_dn: Annotated[Number, Field(ge=1e-6, le=1e9)]
+    gain_e_dn: Annotated[Number, within(1e-6, 1e9)]
     offset_dn: NotNegative = 0.0
-    nonlinearity: Annotated[Number, Field(ge=0, le=0.4)] = 0.0
+    nonlinearity: Annotated[Number, within(0, 0.4)] = 0.0
     intrapixel: Annotated[Number, Field(ge=0, lt=1)] = 0.0
-    brighter_fatter_per_e: Annotated[Number, Field(ge=0, le=1e-3)] = 0.0
-    edge_px: Annotated[Number, Field(ge=-10, le=10)] = 0.0
-    edge_reach_px: Annotated[Number, Field(gt=0, le=1000)] = 10.0
-    bits: Annotated[int, Field(ge=1, le=16)]
+    brighter_fatter_per_e: Annotated[Number, within(0, 1e-3)] = 0.0
+    edge_px: Annotated[Number, within(-10, 10)] = 0.0
+    edge_reach_px: Annotated[Number, above(0, 1000)] = 10.0
+    bits: Annotated[int, within(1, 16)]
     noise: bool = True
 
     @property
@@ -508,7 +510,7 @@ class DetectorConfig(ConfigModel):
             )
 
 
-Walk = Annotated[Length, Field(ge=-0.1, le=0.1)]
+Walk = Annotated[Length, within(-0.1, 0.1)]
 
 
 class CameraConfig(ConfigModel):
@@ -532,9 +534,9 @@ class CameraConfig(ConfigModel):
 
     width_px: Side
     height_px: Side
-    pixel_m: Annotated[Length, Field(ge=1e-7, le=1e-2)]
-    focal_length_m: Annotated[Length, Field(ge=1e-5, le=1e3)]
-    f_number: Annotated[Number, Field(ge=0.3, le=1e6)]
+    pixel_m: Annotated[Length, within(1e-7, 1e-2)]
+    focal_length_m: Annotated[Length, within(1e-5, 1e3)]
+    f_number: Annotated[Number, within(0.3, 1e6)]
     focus_m: Annotated[
         float, BeforeValidator(focus_distance, json_schema_input_type=FocusText), Field(gt=0)
     ] = math.inf

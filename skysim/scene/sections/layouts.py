@@ -28,6 +28,8 @@ from skysim.core.units import (
     RightAscension,
     Seed,
     Spin,
+    above,
+    within,
 )
 
 HOLES = 9  # holes of a patch board, 3x3
@@ -35,13 +37,13 @@ Level = PositiveFraction
 Levels = NotEmpty[Level]
 Magnitudes = NotEmpty[Magnitude]
 TypeNames = NotEmpty[str]
-Pixels = Annotated[int, Field(ge=1, le=20_000)]
-Cap = Annotated[Number, Field(gt=0, le=90)]
+Pixels = Annotated[int, within(1, 20_000)]
+Cap = Annotated[Number, above(0, 90)]
 MAX_LEDS = 100_000
-Count = Annotated[int, Field(ge=1, le=MAX_LEDS)]
-FieldOfView = Annotated[Number, Field(ge=1, le=90)]
+Count = Annotated[int, within(1, MAX_LEDS)]
+FieldOfView = Annotated[Number, within(1, 90)]
 TapeLength = Annotated[Length, Field(ge=1e-3)]
-LimitMagnitude = Annotated[Number, Field(ge=-2, le=15)]
+LimitMagnitude = Annotated[Number, within(-2, 15)]
 
 
 def relative_levels(magnitudes: Sequence[float]) -> tuple[float, ...]:
@@ -66,7 +68,7 @@ class BoardConfig(ConfigModel):
     """
 
     azimuth_deg: Spin
-    tilt_deg: Annotated[Number, Field(ge=0, le=90)]
+    tilt_deg: Annotated[Number, within(0, 90)]
     rotation_deg: Spin = 0.0
     leds: NotEmpty[Annotated[int, Field(ge=0, lt=HOLES)]]
     levels: Levels | None = None
@@ -112,7 +114,7 @@ class PatchBoardsConfig(ConfigModel):
     pwm_levels: Levels = (1.0,)
     boards: tuple[BoardConfig, ...] = ()
     glue_scatter_m: LengthError = 0.0
-    glue_tilt_deg: Annotated[Number, Field(ge=0, le=30)] = 0.0
+    glue_tilt_deg: Annotated[Number, within(0, 30)] = 0.0
     hardware_seed: Seed = 0
 
     def check(self) -> None:
@@ -147,7 +149,7 @@ class DimmedConfig(ConfigModel):
     cap_deg: Cap
     levels: Levels | None = None
     magnitudes: Magnitudes | None = None
-    unique_neighbors: Annotated[int, Field(ge=3, le=16)] | None = None
+    unique_neighbors: Annotated[int, within(3, 16)] | None = None
     hardware_seed: Seed = 0
 
     @property
@@ -217,7 +219,7 @@ class GeodesicConfig(LitConfig):
     """
 
     kind: Literal["geodesic"]
-    frequency: Annotated[int, Field(ge=1, le=100)]
+    frequency: Annotated[int, within(1, 100)]
     class_: Annotated[Literal["I", "II"], Field(alias="class")] = "I"
     rotation_deg: Spin = 0.0
 
@@ -274,14 +276,14 @@ class OptimizedConfig(DimmedConfig):
     """
 
     kind: Literal["optimized"]
-    count: Annotated[int, Field(ge=3, le=2000)]
-    tilt_deg: Annotated[Number, Field(ge=0, le=60)]
+    count: Annotated[int, within(3, 2000)]
+    tilt_deg: Annotated[Number, within(0, 60)]
     field_deg: tuple[FieldOfView, FieldOfView] | None = None
     camera_m: Position | None = None
     spacing_m: PositiveLength
     coincidence_m: PositiveLength = 1e-3
-    min_leds: Annotated[int, Field(ge=2, le=50)] = 5
-    rounds: Annotated[int, Field(ge=1, le=5000)] = 100
+    min_leds: Annotated[int, within(2, 50)] = 5
+    rounds: Annotated[int, within(1, 5000)] = 100
 
 
 class CelestialConfig(ConfigModel):
@@ -419,7 +421,7 @@ class FibersConfig(ConfigModel):
 
     kind: Literal["fibers"]
     points: Points
-    radius_variation: Annotated[Number, Field(ge=0, le=0.1)] = 0.0
+    radius_variation: Annotated[Number, within(0, 0.1)] = 0.0
     aiming: AimingConfig | None = None
 
     def check(self) -> None:
@@ -457,8 +459,8 @@ class PixelsConfig(ConfigModel):
     pixels: tuple[Pixels, Pixels]
     pitch_m: PositiveLength
     block: Pixels = 1
-    gray_levels: Annotated[int, Field(ge=2, le=65536)] = 256
-    gamma: Annotated[Number, Field(gt=0, le=10)] | Literal["srgb"] | Fractions = 2.2
+    gray_levels: Annotated[int, within(2, 65536)] = 256
+    gamma: Annotated[Number, above(0, 10)] | Literal["srgb"] | Fractions = 2.2
     contrast: Annotated[Positive, Field(ge=2)] | None = None
 
     def check(self) -> None:
@@ -487,7 +489,7 @@ class LensDisplayConfig(PixelsConfig):
     """
 
     focal_length_m: PositiveLength
-    distortion: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    distortion: Annotated[Number, within(-1, 1)] = 0.0
 
     def check(self) -> None:
         corner = math.hypot(*self.pixels) * self.pitch_m / 2 / self.focal_length_m
@@ -545,7 +547,7 @@ class ProjectorConfig(LensDisplayConfig):
     rotation_deg: Spin = 0.0
     f_number: Positive = 2.0
     focus_m: PositiveLength | None = None
-    falloff: Annotated[Number, Field(ge=0, le=10)] = 4.0
+    falloff: Annotated[Number, within(0, 10)] = 4.0
 
     def check(self) -> None:
         sight = [end - start for start, end in zip(self.position_m, self.aim_m, strict=True)]

@@ -14,6 +14,7 @@ from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     AboveZero,
     AxisAngle,
     ConfigModel,
@@ -31,14 +32,17 @@ from skysim.core.units import (
     RadiantIntensity,
     Several,
     TableConfig,
+    Three,
     Time,
     Tolerance,
+    above,
     with_unit,
+    within,
 )
 
 Distance = Literal[3, 5, 7, 11]
 ClockError = Annotated[NumberError, Field(le=10_000)]
-Offset = Annotated[Length, Field(ge=-0.01, le=0.01)]
+Offset = Annotated[Length, within(-0.01, 0.01)]
 
 
 class CosineLobeConfig(ConfigModel):
@@ -246,7 +250,7 @@ class AgingConfig(ConfigModel):
     """
 
     hours: Positive
-    life_hours: Annotated[Number, Field(gt=0, le=1e7)]
+    life_hours: Annotated[Number, above(0, 1e7)]
     scatter: Annotated[NumberError, Field(lt=1), below_one("makes light")] = 0.0
 
 
@@ -290,7 +294,7 @@ Wavelength = Annotated[
     Number,
     Positive,
     with_unit("m", "wavelength", '"630 nm", or white, or a CSV file'),
-    Field(ge=300e-9, le=1100e-9),
+    within(300e-9, 1100e-9),
 ]
 LedSpectrum = Annotated[
     Annotated[
@@ -322,7 +326,7 @@ class LedLightConfig(ConfigModel):
     intensity_cd: AboveZero[Intensity] | None = None
     radiant_intensity_w_sr: AboveZero[RadiantIntensity] | None = None
     spectrum: LedSpectrum = "white"
-    fwhm_m: Annotated[Length, Field(ge=3e-9, le=200e-9)] | None = None
+    fwhm_m: Annotated[Length, within(3e-9, 200e-9)] | None = None
     color_scatter_m: Annotated[LengthError, Field(le=30e-9)] = 0.0
 
     def check(self) -> None:
@@ -368,8 +372,8 @@ class LedConfig(LedLightConfig):
         left out
     """
 
-    disk_diameter_m: Annotated[Length, Field(gt=0, le=0.1)]
-    die_m: tuple[Offset, Offset, Offset] = (0.0, 0.0, 0.0)
+    disk_diameter_m: Annotated[Length, above(0, 0.1)]
+    die_m: Three[Offset] = ZEROS
     falloff: Literal["inverse_square"] = "inverse_square"
     lobe: Lobe = CosineLobeConfig()
     types: dict[str, LedTypeConfig] = Field(default_factory=dict)

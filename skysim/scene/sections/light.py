@@ -23,6 +23,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.plugins import PluginKind
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     ConfigModel,
     Declination,
     Distance,
@@ -39,6 +40,8 @@ from skysim.core.units import (
     Spin,
     Three,
     ZeroOrMore,
+    above,
+    within,
 )
 from skysim.scene.sections.layouts import (
     Cap,
@@ -53,7 +56,7 @@ from skysim.scene.sections.leds import LedConfig
 from skysim.scene.sections.surroundings import AirConfig, SatellitesConfig
 
 SKY = "gaia_v8.0"  # its faintest stars are as faint as any camera of a shipped scene detects
-Tilt = Annotated[Number, Field(ge=-45, le=45)]
+Tilt = Annotated[Number, within(-45, 45)]
 
 
 class SurfaceConfig(ConfigModel):
@@ -74,7 +77,7 @@ class SurfaceConfig(ConfigModel):
     """
 
     kind: Literal["sphere", "ellipsoid", "flat", "cylinder", "surveyed"]
-    offset_m: Position = (0.0, 0.0, 0.0)
+    offset_m: Position = ZEROS
     tilt_deg: tuple[Tilt, Tilt] = (0.0, 0.0)
     error_m: LengthError = 0.0
 
@@ -183,7 +186,7 @@ class SurveyedSurfaceConfig(RimmedConfig):
     kind: Literal["surveyed"]
     file: str
     unit: Literal["m", "cm", "mm", "in"]
-    degree: Annotated[int, Field(ge=0, le=12)] = 6
+    degree: Annotated[int, within(0, 12)] = 6
     rms_limit_m: PositiveLength = 1e-3
 
     def check(self) -> None:
@@ -229,7 +232,7 @@ class RoomConfig(ConfigModel):
     width_m: PositiveLength | None = None
     length_m: PositiveLength | None = None
     door_m: tuple[PositiveLength, PositiveLength] | None = None
-    segments: Annotated[int, Field(ge=1, le=100)] = 1
+    segments: Annotated[int, within(1, 100)] = 1
     thickness_m: ZeroOrMore[Length] = 0.0
 
     def check(self) -> None:
@@ -279,7 +282,7 @@ class ReflectionConfig(ConfigModel):
 
     diffuse: Annotated[Fraction, Field(lt=1)] = 0.0
     specular: Annotated[Fraction, Field(lt=1)] = 0.0
-    refractive_index: Annotated[Number, Field(gt=1, le=4)] | None = None
+    refractive_index: Annotated[Number, above(1, 4)] | None = None
     floor: FloorConfig | None = None
 
     def check(self) -> None:
@@ -417,7 +420,7 @@ class StarsConfig(ConfigModel):
 
     kind: Literal["stars"]
     catalog: str = SKY
-    limit_mag: Annotated[Number, Field(ge=0, le=15)] | None = None
+    limit_mag: Annotated[Number, within(0, 15)] | None = None
     variability_seed: Seed | None = None
     bodies: BodiesConfig | None = None
     satellites: SatellitesConfig | None = None

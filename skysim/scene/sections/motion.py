@@ -12,6 +12,7 @@ from pydantic import (
 from skysim.core.errors import InputError
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     AboveZero,
     ConfigModel,
     Declination,
@@ -27,6 +28,7 @@ from skysim.core.units import (
     Spins,
     Three,
     TimeLimit,
+    within,
 )
 from skysim.core.yaml_reader import ExistingFile
 from skysim.scene.sections.vehicle import ActuatorsName
@@ -94,7 +96,7 @@ class JitterBandConfig(ConfigModel):
     from_hz: Positive
     to_hz: Positive
     rms_arcsec: AxesRms
-    slope: Annotated[Number, Field(ge=-6, le=6)] = 0.0
+    slope: Annotated[Number, within(-6, 6)] = 0.0
 
     def check(self) -> None:
         if self.from_hz >= self.to_hz:
@@ -336,7 +338,7 @@ class ControlConfig(ConfigModel):
     time_limit_s: TimeLimit = 10.0
     actuators: ActuatorsName = "ideal"
     feedback: Literal["truth", "imu", "filter"] = "truth"
-    rate_hz: Annotated[Number, Field(ge=1, le=1000)] = 100.0
+    rate_hz: Annotated[Number, within(1, 1000)] = 100.0
     bandwidth_rad_s: Positive = 3.0
     damping: Positive = 0.8
     integral_rad_s: Positive = 0.6
@@ -384,7 +386,7 @@ class MotionConfig(ConfigModel):
     """
 
     start: Start = AttitudeConfig()
-    rate_deg_s: StartRate = (0.0, 0.0, 0.0)
+    rate_deg_s: StartRate = ZEROS
     control: Annotated[
         ControlConfig | None,
         BeforeValidator(

@@ -9,6 +9,7 @@ from skysim.core.constants import FWHM_PER_SIGMA, SUN_V_MAG
 from skysim.core.errors import InputError
 from skysim.core.units import (
     BY_KIND,
+    ZEROS,
     AxisAngle,
     ConfigModel,
     Declination,
@@ -29,6 +30,8 @@ from skysim.core.units import (
     Temperature,
     Three,
     Whole,
+    above,
+    within,
 )
 from skysim.core.yaml_reader import ExistingFile
 
@@ -36,7 +39,7 @@ from skysim.core.yaml_reader import ExistingFile
 
 NEGLIGIBLE_PX = 0.02  # a blur of this sigma makes an image of 0.7 px wider by 0.0003 px
 Altitude = Annotated[Number, Field(ge=0, lt=90)]
-Darkness = Annotated[Number, Field(ge=10, le=30)]  # of a sky, mag/arcsec²
+Darkness = Annotated[Number, within(10, 30)]  # of a sky, mag/arcsec²
 
 
 class HorizonConfig(TableConfig):
@@ -92,15 +95,15 @@ class AirConfig(ConfigModel):
         Sky, twilight and moonlight; none if left out
     """
 
-    pressure_hpa: Annotated[Number, Field(ge=0, le=1100)] | None = None
-    temperature_c: Annotated[Number, Field(ge=-80, le=50)] | None = None
+    pressure_hpa: Annotated[Number, within(0, 1100)] | None = None
+    temperature_c: Annotated[Number, within(-80, 50)] | None = None
     humidity: Fraction = 0.5
-    wavelength_m: Annotated[Length, Field(ge=300e-9, le=2e-6)] | None = None
-    extinction_mag: Annotated[Number, Field(ge=0, le=5)] = 0.172
-    color_extinction_mag: Annotated[Number, Field(ge=-1, le=1)] = 0.0
+    wavelength_m: Annotated[Length, within(300e-9, 2e-6)] | None = None
+    extinction_mag: Annotated[Number, within(0, 5)] = 0.172
+    color_extinction_mag: Annotated[Number, within(-1, 1)] = 0.0
     dispersion: bool = False
     scintillation: bool = True
-    seeing_arcsec: Annotated[Number, Field(ge=0, le=20)] = 0.0
+    seeing_arcsec: Annotated[Number, within(0, 20)] = 0.0
     horizon: HorizonConfig | None = None
     glow: AirGlowConfig | None = None
 
@@ -112,7 +115,7 @@ class AirConfig(ConfigModel):
 
 # The scene section `thermal`: the temperature of the laboratory and its effects.
 
-Coefficient = Annotated[Number, Field(ge=-10_000, le=10_000)]
+Coefficient = Annotated[Number, within(-10_000, 10_000)]
 Coefficients = Three[Coefficient]
 
 
@@ -128,7 +131,7 @@ class LinearTemperatureConfig(ConfigModel):
 
     kind: Literal["linear"]
     start_c: Temperature
-    rate_c_h: Annotated[Number, Field(ge=-100, le=100)]
+    rate_c_h: Annotated[Number, within(-100, 100)]
 
 
 class SineTemperatureConfig(ConfigModel):
@@ -136,7 +139,7 @@ class SineTemperatureConfig(ConfigModel):
 
     kind: Literal["sine"]
     mean_c: Temperature
-    amplitude_c: Annotated[Number, Field(gt=0, le=100)]
+    amplitude_c: Annotated[Number, above(0, 100)]
     period_s: Duration
     phase_deg: Spin = 0.0
 
@@ -180,11 +183,11 @@ class ThermalConfig(ConfigModel):
 
     temperature: Temperatures
     reference_c: Temperature = 20.0
-    speed: Annotated[Number, Field(ge=1, le=1e5)] = 1.0
+    speed: Annotated[Number, within(1, 1e5)] = 1.0
     dome_ppm_k: Coefficient = 0.0
     anchor_height_m: Length = 0.0
-    creep_m: Position = (0.0, 0.0, 0.0)
-    mount_arcsec_k: Coefficients = (0.0, 0.0, 0.0)
+    creep_m: Position = ZEROS
+    mount_arcsec_k: Coefficients = ZEROS
     lens_ppm_k: Coefficient = 0.0
 
     @property
@@ -204,7 +207,7 @@ class ThermalConfig(ConfigModel):
 # The scene sections `orbit`, with the Earth's light and exclusion angles, and `light.satellites`.
 
 ExclusionAngle = Annotated[Number, Field(ge=0, lt=180)]
-Rate = Annotated[Number, Field(gt=0, le=30)]
+Rate = Annotated[Number, above(0, 30)]
 
 
 class RandomSatellitesConfig(ConfigModel):
@@ -222,7 +225,7 @@ class RandomSatellitesConfig(ConfigModel):
         Seed of these draws, together with the scene's seed
     """
 
-    per_field: Annotated[Number, Field(gt=0, le=1000)]
+    per_field: Annotated[Number, above(0, 1000)]
     rate_deg_s: tuple[Rate, Rate] = (0.05, 1.5)
     v_mag: tuple[Magnitude, Magnitude] = (2.0, 8.0)
     seed: Seed
@@ -319,7 +322,7 @@ class CircularOrbitConfig(OrbitConfig):
     """
 
     kind: Literal["circular"]
-    altitude_m: Annotated[Distance, Field(ge=100e3, le=1e9)]
+    altitude_m: Annotated[Distance, within(100e3, 1e9)]
     inclination_deg: AxisAngle
     raan_deg: Spin = 0.0
     argument_deg: Spin = 0.0
@@ -336,7 +339,7 @@ class TleOrbitConfig(OrbitConfig):
 
     kind: Literal["tle"]
     file: ExistingFile
-    number: Annotated[int, Field(ge=0, le=999_999_999)] | None = None
+    number: Annotated[int, within(0, 999_999_999)] | None = None
 
 
 class OemOrbitConfig(OrbitConfig):
@@ -359,14 +362,14 @@ class UniformGlowConfig(ConfigModel):
     """Uniform glow: e_s electrons per second in every pixel (a light leak, a lit room)."""
 
     kind: Literal["uniform"]
-    e_s: Annotated[Number, Field(ge=0, le=1e12)]
+    e_s: Annotated[Number, within(0, 1e12)]
 
 
 class SkyGlowConfig(ConfigModel):
     """Surface brightness of the night sky at the boresight, with a relative gradient along the axes of the image."""
 
     kind: Literal["sky"]
-    mag_arcsec2: Annotated[Number, Field(ge=0, le=30)]
+    mag_arcsec2: Annotated[Number, within(0, 30)]
     gradient_per_deg: tuple[Coefficient, Coefficient] = (0.0, 0.0)
 
 
@@ -387,7 +390,7 @@ class MoonGlowConfig(ConfigModel):
     ra_deg: RightAscension
     dec_deg: Declination
     phase_angle_deg: AxisAngle
-    extinction_mag: Annotated[Number, Field(ge=0, le=2)] = 0.172
+    extinction_mag: Annotated[Number, within(0, 2)] = 0.172
     moon_zenith_deg: ZenithDistance
     field_zenith_deg: ZenithDistance
 
@@ -423,7 +426,7 @@ class FaintStarsGlowConfig(ConfigModel):
     """
 
     kind: Literal["faint_stars"]
-    fainter_than_mag: Annotated[Number, Field(ge=6, le=15)]
+    fainter_than_mag: Annotated[Number, within(6, 15)]
 
 
 class ZodiacalGlowConfig(ConfigModel):

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    ZEROS,
     ConfigModel,
     Delay,
     Duration,
@@ -25,6 +26,7 @@ from skysim.core.units import (
     Time,
     TimeLimit,
     Whole,
+    within,
 )
 from skysim.core.yaml_reader import ExistingFile, value_at
 from skysim.scene.sections.camera import Distortion
@@ -96,7 +98,7 @@ class SurveyErrorsConfig(ConfigModel):
         Seed of the errors
     """
 
-    rotation_deg: Spins = (0.0, 0.0, 0.0)
+    rotation_deg: Spins = ZEROS
     surface_seed: Seed | None = None
     led_sigma_m: PlaceError = 0.0
     lever_sigma_m: PlaceError = 0.0
@@ -153,9 +155,9 @@ class DecoderConfig(ConfigModel):
         Number of last frames whose brightness is used; that of the bits of the code if left out
     """
 
-    flux_sigma: Annotated[Number, Field(ge=1e-6, le=1)] = 0.03
-    gate_px: Annotated[Number, Field(ge=1, le=10_000)] = 60.0
-    frames: Annotated[int, Field(ge=3, le=10_000)] | None = None
+    flux_sigma: Annotated[Number, within(1e-6, 1)] = 0.03
+    gate_px: Annotated[Number, within(1, 10_000)] = 60.0
+    frames: Annotated[int, within(3, 10_000)] | None = None
 
 
 class ComputerConfig(ConfigModel):
@@ -250,7 +252,7 @@ class TrackerConfig(ConfigModel):
     centroider: str | None = None
     identifier: str | None = None
     acceptance: Literal["evidence", "thesis"] = "evidence"
-    cos_error: Annotated[Number, Field(ge=1e-12, le=0.1)] | None = None
+    cos_error: Annotated[Number, within(1e-12, 0.1)] | None = None
     solver: str | None = None
     threshold_sigma: Positive = 5.0
     min_area_px: PositiveInt = 3
@@ -264,14 +266,14 @@ class TrackerConfig(ConfigModel):
     gyro: bool = False
     orbit_velocity: bool = True
     refraction: bool = False
-    brightest: Annotated[int, Field(ge=3, le=1000)] | None = None
+    brightest: Annotated[int, within(3, 1000)] | None = None
     assumed_camera_body_m: Position | None = None
     survey: SurveyErrorsConfig = SurveyErrorsConfig()
     exposure_control: ExposureControlConfig | None = None
     decoder: DecoderConfig | None = None
-    brightness_sigma: Annotated[Number, Field(ge=0.02, le=2)] | None = None
+    brightness_sigma: Annotated[Number, within(0.02, 2)] | None = None
     assumed_attitude_deg: Spins | None = None
-    magnitude_sigma: Annotated[Number, Field(ge=0.01, le=5)] | None = None
+    magnitude_sigma: Annotated[Number, within(0.01, 5)] | None = None
     computer: ComputerConfig | None = None
     map: ExistingFile | None = None
 

@@ -6,6 +6,7 @@ from pydantic import Field
 
 from skysim.core.errors import InputError
 from skysim.core.units import (
+    ZEROS,
     AboveZero,
     ConfigModel,
     Damping,
@@ -34,6 +35,8 @@ from skysim.core.units import (
     Time,
     Torque,
     ZeroOrMore,
+    above,
+    within,
 )
 
 # Keys of `vehicle`, and the ideal torques.
@@ -41,8 +44,8 @@ ActuatorsName = Literal["ideal", "wheels", "fans", "thrusters", "trims", "cmgs"]
 TorqueLimit = AboveZero[Torque]
 TorqueLevel = ZeroOrMore[Torque]
 Friction = ZeroOrMore[Damping]
-Bend = Annotated[Number, Field(ge=-3600, le=3600)]
-Deviation = Annotated[Length, Field(ge=-1e-3, le=1e-3)]
+Bend = Annotated[Number, within(-3600, 3600)]
+Deviation = Annotated[Length, within(-1e-3, 1e-3)]
 LagTime = Annotated[Time, Field(ge=5e-3)]
 
 
@@ -159,7 +162,7 @@ class CmgsConfig(ConfigModel):
         Greatest motor torque on the rotors of variable-speed CMGs; the rotor speeds are constant if left out
     """
 
-    rotor_rpm: Annotated[Number, Field(gt=0, le=60_000)] = 2600.0
+    rotor_rpm: Annotated[Number, above(0, 60_000)] = 2600.0
     gimbal_rate_limit_deg_s: Positive = 60.0
     gimbal_time_constant_s: LagTime = 0.01
     steering: Literal["pseudo_inverse", "singularity_robust"] = "singularity_robust"
@@ -223,7 +226,7 @@ class DisturbancesConfig(ConfigModel):
         Cable and air currents
     """
 
-    turbine_nm: Three[Torque] = (0.0, 0.0, 0.0)
+    turbine_nm: Three[Torque] = ZEROS
     earth_rotation: bool = False
     cable: CableConfig | None = None
     air_current: AirCurrentConfig | None = None
@@ -287,11 +290,11 @@ class ImuConfig(ConfigModel):
         Seed of the unit's turn-on bias, scale factors and misalignments
     """
 
-    rate_hz: Annotated[Number, Field(ge=10, le=1000)] = 400.0
+    rate_hz: Annotated[Number, within(10, 1000)] = 400.0
     gyro: GyroConfig = GyroConfig()
     accelerometer: AccelerometerConfig = AccelerometerConfig()
     earth_rate: Literal["none", "uncompensated", "compensated"] = "none"
-    home_error_deg: Spins = (0.0, 0.0, 0.0)
+    home_error_deg: Spins = ZEROS
     hardware_seed: Seed = 200
 
 
@@ -355,10 +358,10 @@ class VehicleConfig(ConfigModel):
     inertia_kg_m2: Three[Inertia] | None = None
     center_of_mass_m: Position | None = None
     camera_m: Position | None = None
-    camera_rotation_deg: Spins = (0.0, 0.0, 0.0)
+    camera_rotation_deg: Spins = ZEROS
     sag_arcsec: tuple[Bend, Bend] = (0.0, 0.0)
-    mast_m: Annotated[Length, Field(ge=-10, le=10)] = 0.0
-    runout_m: tuple[Deviation, Deviation, Deviation] = (0.0, 0.0, 0.0)
+    mast_m: Annotated[Length, within(-10, 10)] = 0.0
+    runout_m: Three[Deviation] = ZEROS
     tilt_stop_deg: Annotated[Number, Field(gt=0, lt=90)] = 30.0
     torque_limit_nm: TorqueLimit = 1.0
     wheels: WheelsConfig | None = None
@@ -416,7 +419,7 @@ class SiteConfig(ConfigModel):
         Azimuth of the lab's x axis from north through east
     """
 
-    latitude_deg: Annotated[Number, Field(ge=-90, le=90)] = 39.8
-    longitude_deg: Annotated[Number, Field(ge=-180, le=360)] | None = None
-    height_m: Annotated[Length, Field(ge=-500, le=10_000)] = 0.0
+    latitude_deg: Annotated[Number, within(-90, 90)] = 39.8
+    longitude_deg: Annotated[Number, within(-180, 360)] | None = None
+    height_m: Annotated[Length, within(-500, 10_000)] = 0.0
     x_azimuth_deg: Spin = 90.0

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog import catalog
 from estimator.core.camera import Camera
-from skysim.core.types import Floats, Ints, Sources, frozen, lengths, normalized
+from skysim.core.types import Floats, Ints, Sources, frozen, lengths, median, normalized
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks.views import CameraModel
@@ -115,7 +115,7 @@ def of(lab: Lab, camera: CameraModel) -> Beliefs:
         mapped = dome_map_file.read_dome_map(Path(tracker.map))
         return Beliefs(
             *known,
-            float(np.median(mapped.sigma_m)),
+            median(mapped.sigma_m),
             mapped.lever_sigma_m,
             mapped.focal_sigma_px / mapped.focal_px,
             np.zeros(3),

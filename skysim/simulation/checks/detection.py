@@ -26,7 +26,7 @@ from estimator.detection.detect import (
 from estimator.trackers.pipeline import SATURATED_SIGMA_PX, Settings
 from skysim.camera.detector import repel, saturation_dn
 from skysim.core.constants import GOLDEN_ANGLE_RAD
-from skysim.core.types import Bools, Floats, Ints
+from skysim.core.types import Bools, Floats, Ints, median
 from skysim.scene.scene import Scene
 from skysim.simulation.checks import beliefs
 from skysim.simulation.checks.beliefs import Beliefs
@@ -274,7 +274,7 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
         along, across = weighted_variance(view, n_e, noise_e2, weight)
         along = along + end_sigma_px(view, context) ** 2
         if centroider == "weighted" and len(view):
-            curve_px2 = sampling_variance(float(np.median(view.sigma_px)) ** 2 / 2)
+            curve_px2 = sampling_variance(median(view.sigma_px) ** 2 / 2)
             floor += np.where(length_px < 1, curve_px2, 0.0)[:, None]  # a path averages it
     # 2. Sensitivity of the pixels, between that of a Gaussian and that of a disk.
     disk = (view.disk_px**2 + view.defocus_px**2) / 4 / view.sigma_px**2

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Record, around_z, polar_rad
+from skysim.core.types import Floats, Record, around_z, median, polar_rad
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
 from skysim.simulation.checks.detection import Context, centroid_variance
 from skysim.simulation.checks.expected_error import mean_root
@@ -126,7 +126,7 @@ def spot(plan: Plan) -> Fact:
             {"lens_px": lens_px},
         )
     width, disk_px, defocus_px = (
-        float(np.median(one)) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus)
+        median(one) for one in (GAUSSIAN_WIDTH * sigma, 2 * disk, 2 * defocus)
     )
     led = f", LED {disk_px:.1f}" if plan.scene.dome else ""
     text = f"{width:.1f} px wide (D4σ): lens {lens_px:.1f}{led}, defocus {defocus_px:.1f} px"
@@ -184,8 +184,8 @@ def smear(plan: Plan) -> Fact:
         values["uneven_px"] = uneven
         text += f"; jitter moves images by {short(uneven, 2)} px (rms) beside that path"
     if length_px[fastest] > 0:
-        width_px = GAUSSIAN_WIDTH * float(
-            np.median(np.concatenate([view.sigma_px for view in frames.known]))
+        width_px = GAUSSIAN_WIDTH * median(
+            np.concatenate([view.sigma_px for view in frames.known])
         )
         values["width_rate_deg_s"] = rate_deg_s[fastest] * width_px / length_px[fastest]
         text += f"; as long as the image is wide at {short(values['width_rate_deg_s'])} deg/s"

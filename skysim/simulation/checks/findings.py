@@ -13,6 +13,7 @@ import numpy as np
 from skysim.camera import as_built
 from skysim.camera.detector import saturation_dn
 from skysim.core.constants import ARCSEC_RAD
+from skysim.core.types import median
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
@@ -255,7 +256,7 @@ def undetected(plan: Plan) -> str:
             f" {settings.min_area_px}; change it to {max(int(np.median(area) / 3), 1)}"
         )
     peak_e = plan.frames.joined("peak_e") - plan.camera.background_e
-    factor = 3 * threshold_e(plan) / max(float(np.median(peak_e)), 1e-3)
+    factor = 3 * threshold_e(plan) / max(median(peak_e), 1e-3)
     text = f"{text}: the others are below the threshold"
     if scene.tracker.threshold_sigma > HIGH_THRESHOLD:
         return f"tracker.threshold_sigma: {text} of {scene.tracker.threshold_sigma:g} sigma; change it to 5"
@@ -399,10 +400,8 @@ def out_of_focus(plan: Plan) -> str:
     distance_m = sampled.joined("distance_m")
     if not len(defocus):
         return ""
-    blur_px = 2 * float(np.median(defocus))
-    sharp_px = GAUSSIAN_WIDTH * float(
-        np.median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0)))
-    )
+    blur_px = 2 * median(defocus)
+    sharp_px = GAUSSIAN_WIDTH * median(np.sqrt(np.maximum(sigma**2 - defocus**2 / 4, 0)))
     if blur_px <= max(MAX_DEFOCUS * sharp_px, MIN_DEFOCUS_PX):
         return ""
     # Defocus is proportional to the difference of 1 / distance, so the best focus is at the middle of it; 0 for stars.
@@ -420,7 +419,7 @@ def long_smear(plan: Plan) -> str:
     sigma = frames.joined("sigma_px")
     if not len(length_px):
         return ""
-    limit_px = max(MAX_SMEAR_PX, MAX_SMEAR_WIDTHS * GAUSSIAN_WIDTH * float(np.median(sigma)))
+    limit_px = max(MAX_SMEAR_PX, MAX_SMEAR_WIDTHS * GAUSSIAN_WIDTH * median(sigma))
     longest_px = float(length_px.max())
     if longest_px <= limit_px:
         return ""

@@ -22,7 +22,7 @@ import numpy as np
 
 from skysim.camera import wcs
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Record, lengths, polar_rad
+from skysim.core.types import Floats, Record, lengths, median, polar_rad
 from skysim.scene.sections.light import DomeConfig, SurveyedSurfaceConfig
 from skysim.simulation.checks import attitudes, sky_warnings, vehicle_facts
 from skysim.simulation.checks.attitudes import CheckedAttitudes
@@ -256,11 +256,9 @@ def dome_warnings(lab: Lab) -> list[str]:
     if scene.tracker.detector == "local":
         camera = scene.camera
         distance_m = lengths(sources.xyz)
-        typical_m = float(
-            np.median(distance_m - np.linalg.norm(lab.camera.mount.camera_body_m))
-        )
+        typical_m = median(distance_m - np.linalg.norm(lab.camera.mount.camera_body_m))
         blur = camera.pupil_m * abs(1 / typical_m - 1 / camera.focus_m)
-        width = 2 * float(np.median(sources.radius_m)) / typical_m + blur
+        width = 2 * median(sources.radius_m) / typical_m + blur
         if (width_px := camera.focal_px * width) > MAX_IMAGE_PX:
             lines.append(
                 f"tracker.detector: LED images are {width_px:.0f} px wide; local treats images wider than"
@@ -269,7 +267,7 @@ def dome_warnings(lab: Lab) -> list[str]:
     # 4. Exposures shorter than the LED drive's cycle, so that a frame shows only some of the LEDs.
     time_s = scene.exposure.time_s
     cycles_s = sources.period_s[sources.on_s < sources.period_s]
-    if len(cycles_s) and time_s < (cycle_s := float(np.median(cycles_s))):
+    if len(cycles_s) and time_s < (cycle_s := median(cycles_s)):
         lines.append(
             f"exposure.time: {time_s:g} s is shorter than the LED drive's cycle of {cycle_s:g} s: a frame"
             f" covers {100 * time_s / cycle_s:.2g} % of a cycle"
@@ -357,8 +355,8 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     lab = plan.lab
     camera = plan.camera.optics.camera
     sigma_px = [believed_sigma_px(view, plan) for view in plan.reach.used if len(view)]
-    distance_m = float(np.median(plan.reach.joined("distance_m")))
-    typical_px = float(np.median(np.concatenate(sigma_px)))
+    distance_m = median(plan.reach.joined("distance_m"))
+    typical_px = median(np.concatenate(sigma_px))
     coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px
     # 2. Greatest tilt of the fields, reduced to what most_work allows.
     place_m = plan.beliefs.lights.xyz

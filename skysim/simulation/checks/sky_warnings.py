@@ -8,7 +8,7 @@ import numpy as np
 
 from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats
+from skysim.core.types import Floats, median
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
@@ -171,7 +171,7 @@ def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
         weighted = np.linalg.solve(believed, view.jacobian)
         information = np.einsum("nij,nik->jk", view.jacobian, weighted)
         found.append(float(np.trace(information @ errors)))
-    return float(np.median(found)) if found else math.nan
+    return median(found) if found else math.nan
 
 
 def claimed(plan: Plan) -> float:

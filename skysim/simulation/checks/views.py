@@ -15,7 +15,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
@@ -23,7 +22,7 @@ from skysim.camera.optics import Optics
 from skysim.camera.projection import rates_e_s
 from skysim.camera.psf.kernel import build_kernel
 from skysim.camera.psf.otf import blur_radius_px, chromatic_sigma_px, field_sigma_px
-from skysim.core.types import Bools, Floats, Ints, Mount, Sources, lengths
+from skysim.core.types import Array, Bools, Floats, Ints, Mount, Sources, lengths, median
 from skysim.simulation.exposure import expected_exposure, on_detector
 from skysim.simulation.lab import Lab
 from skysim.simulation.lights.light import Exposure, Lit, Occluder, beam_of
@@ -81,7 +80,7 @@ class View(NamedTuple):
     sigma_px: Floats
     streak_px: Floats
     peak_e: Floats
-    behind: NDArray
+    behind: Array
 
     def __len__(self) -> int:
         return len(self.row)
@@ -109,7 +108,7 @@ class View(NamedTuple):
         """(n,) variances of the lens's image, without LED, defocus and motion."""
         return self.sigma_px**2 - (self.disk_px**2 + self.defocus_px**2) / 4
 
-    def take(self, which: NDArray) -> "View":
+    def take(self, which: Array) -> "View":
         """The lights selected by a mask or by indices."""
         return View(*self[:2], *(column[which] for column in self[2:]))
 
@@ -158,7 +157,7 @@ class CameraModel(NamedTuple):
                 glow_e[lit.name] += exposure_s * float(np.mean(lit.glow()))
             edged_e_s = lit.edged() if lit.edged and lit.hides is None else None
             if edged_e_s is not None:
-                glow_e[lit.name] += exposure_s * float(np.median(edged_e_s))
+                glow_e[lit.name] += exposure_s * median(edged_e_s)
         dark_e_s = detector.dark_e_s * 2.0**detector.doublings
         background_e = sum(glow_e.values()) + dark_e_s * exposure_s
         # Variances of the fixed pattern and of the read-out; a converter's step q has the variance q^2 / 12.

@@ -29,13 +29,12 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats, Ints
+from skysim.core.types import Array, Floats, Ints
 from skysim.scene.sections.leds import BchCodeConfig, Code, CyclicCodeConfig
 
-Words = NDArray[np.uint8]
+Words = Array[np.uint8]
 NO_WORDS: Words = np.zeros((0, 1), np.uint8)
 
 # Primitive polynomials over GF(2) by degree, as bits: x^5 + x^2 + 1 is 0b100101.

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from skysim.core.constants import INCH_M
-from skysim.core.errors import InputError
+from skysim.core.errors import InputError, errors_within
 from skysim.core.text import cells_of, read_lines, to_numbers
 from skysim.core.types import (
     Floats,
@@ -267,11 +267,9 @@ class SurfaceFit:
 
 def read(file: str, unit: str) -> Floats:
     """(N, 3) points, m, of a file: comments (#), a line of names, then lines of x, y, z. Raises InputError."""
-    try:
+    with errors_within(KEY):
         rows = cells_of(read_lines(Path(file)))[1:]
         return to_numbers(file, rows, 3) * UNIT_M[unit]
-    except InputError as error:
-        raise error.within(KEY) from None
 
 
 def covered_rad(unit: Floats) -> tuple[float, float]:

@@ -13,12 +13,12 @@ from dataclasses import field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.types import (
     UP,
+    Array,
     Bools,
     Floats,
     Record,
@@ -154,7 +154,7 @@ class Surface(ABC):
         return self.nearest_ellipsoid()[:2]
 
 
-def unit_vectors(z: NDArray, azimuth: NDArray) -> Floats:
+def unit_vectors(z: Array, azimuth: Array) -> Floats:
     """(..., 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (...,) each."""
     return around_z(np.sqrt(1 - z**2), azimuth, z)
 

@@ -256,7 +256,7 @@ def characterize(
         written = frame_files.write_frames(config, frames_to, seed)
         paths = list(progress(written, total, "rendering"))
         if json:
-            print_json({"frames": len(paths), "folder": str(frames_to)})
+            print_json({"frames": len(paths), "folder": frames_to})
         else:
             places = f"--darks {frames_to / 'darks'} --flats {frames_to / 'flats'}"
             print_wrapped(f"{len(paths)} frames: {places}")
@@ -478,7 +478,7 @@ def camera_new(
     filled = camera_sheet.fill(given or ask_all())
     write_file(out, camera_sheet.text(filled, name or out.stem))
     if json:
-        print_json({"file": str(out), "missing": [one._asdict() for one in filled.missing]})
+        print_json({"file": out, "missing": [one._asdict() for one in filled.missing]})
         return
     lens, chip = read_camera(str(out), None)
     field = f"; {lens.field_text()}" if lens else ""

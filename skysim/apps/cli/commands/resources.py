@@ -421,7 +421,7 @@ def write_cat(stars: OnBoard, path: Path, json: bool) -> None:
 def print_cat(stars: OnBoard, path: Path, json: bool) -> None:
     """Print the contents of a .cat file."""
     facts = {
-        "path": str(path),
+        "path": path,
         "entries": len(stars),
         "stars": int(stars.components.sum()),
         "epoch_jyear": stars.epoch_yr,

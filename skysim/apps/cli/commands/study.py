@@ -307,7 +307,7 @@ def study_status(plan: Plan, store: Store) -> Record:
         **store.counts(),
         "code": store.meta("code"),
         "seconds": sum(run["seconds"] for run in store.runs()),
-        "store": str(store.path),
+        "store": store.path,
     }
 
 
@@ -392,7 +392,7 @@ def write_report(plan: Plan, place: Place, json: bool, open_: bool) -> None:
         return
     columns = table.to_columns(table.select_responses(found.lines, plan.study.responses))
     told = {
-        "report": str(path),
+        "report": path,
         "points": columns,
         "answers": found.answers,
         "findings": found.about.findings,

@@ -19,7 +19,7 @@ from estimator.trackers.pipeline import Report
 from skysim.camera.projection import Poses, in_view, project_each, rates_e_s
 from skysim.camera.render import Window
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, Ints, Trajectory, homogeneous, taken
+from skysim.core.types import Floats, Ints, Trajectory, homogeneous, lengths, taken
 from skysim.experiments.study.plan import CentroidTrial
 from skysim.scene.scene import Scene
 from skysim.simulation.exposure import exposure_of
@@ -142,8 +142,7 @@ def with_direction_noise(
     """
     focal_px = scene.camera.focal_px
     rays = homogeneous((xy_px - scene.camera.center_px) / focal_px, 1.0)
-    lengths = np.linalg.norm(rays, axis=1, keepdims=True)
-    moved = rays + sigma_rad * lengths * rng.standard_normal(rays.shape)
+    moved = rays + sigma_rad * lengths(rays)[:, None] * rng.standard_normal(rays.shape)
     return xy_px + focal_px * (moved[:, :2] / moved[:, 2:] - rays[:, :2])
 
 

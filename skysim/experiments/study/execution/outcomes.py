@@ -6,7 +6,6 @@ from math import nan
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from estimator.core.types import Attitude, StarMatch
@@ -16,7 +15,18 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core import quaternion
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.jit import jit
-from skysim.core.types import UP, Floats, Telemetry, Truth, frozen
+from skysim.core.types import (
+    UP,
+    Array,
+    Floats,
+    Ints,
+    Record,
+    Telemetry,
+    Truth,
+    frozen,
+    lengths,
+    median,
+)
 from skysim.results import metrics
 from skysim.results.telemetry_report import attitude_error_deg, saturated_s
 from skysim.simulation.lab import Lab
@@ -207,11 +217,11 @@ def score(
     cam_from_lab = quaternion.multiply(cam_from_body, quaternion.inverse(lab_from_body))
     streak_px = nan
     if lights.streak_px is not None and len(lights.streak_px):
-        streak_px = float(np.median(lights.streak_px))
+        streak_px = median(lights.streak_px)
     reach_px = SAME_LIGHT_PX + (0.0 if math.isnan(streak_px) else streak_px / 2)
     own_tracker = isinstance(estimator, StarTracker | DomeTracker)
     errors_px = distances_px(centroids_px, lights.flux_xy_px, reach_px)
-    common: dict[str, Any] = {
+    common: Record = {
         "stars": len(lights.xy_px),
         "detected": len(centroids_px),
         "matched": len(solution.match.observed) if solution.match else 0,
@@ -304,7 +314,7 @@ def count_wrong_matches(
     nearest, _ = nearest_light(claimed_px, lights.xy_px)
     expected_px = claimed_px + lights.flux_xy_px[nearest] - lights.xy_px[nearest]
     # NaN counts as wrong.
-    return int(np.sum(~(np.linalg.norm(observed_px - expected_px, axis=1) <= reach_px)))
+    return int(np.sum(~(lengths(observed_px - expected_px) <= reach_px)))
 
 
 def distances_px(xy_px: Floats, others_px: Floats, reach_px: float) -> Floats:
@@ -314,7 +324,7 @@ def distances_px(xy_px: Floats, others_px: Floats, reach_px: float) -> Floats:
 
 
 @jit
-def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[NDArray[np.int64], Floats]:
+def nearest_light(xy_px: Floats, lights_px: Floats) -> tuple[Ints, Floats]:
     """(K,) row of the light nearest to each position, and its distance; 0 and infinity without lights."""
     nearest = np.zeros(len(xy_px), np.int64)
     distance_px = np.full(len(xy_px), math.inf)
@@ -426,6 +436,6 @@ def rms(values: Floats) -> float:
     return float(metrics.rms(values)) if len(values) else nan
 
 
-def mean(values: list[Any] | NDArray[Any]) -> float:
+def mean(values: list[Any] | Array) -> float:
     """Mean; NaN without values."""
     return float(np.mean(values)) if len(values) else nan

@@ -25,12 +25,12 @@ import numpy as np
 
 from skysim.core.errors import InputError
 from skysim.core.files import make_folder, remove, room_left
-from skysim.core.types import Bools, Record
+from skysim.core.types import Array, Bools, Record
 from skysim.experiments.study.execution.outcomes import FIELDS
 from skysim.experiments.study.execution.trials import Row
 from skysim.experiments.study.factors import Point
 from skysim.results.files import row_parts
-from skysim.results.files.row_parts import Array, Part, Rows
+from skysim.results.files.row_parts import Part, Rows
 
 STORE = "study.sqlite"  # file name in a study's results folder
 FORMAT = 10  # raised when the columns of `trials` or `timings` change
@@ -101,6 +101,7 @@ class Store:
     def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
         self.path = path
         self.db = connection
+        self.execute = connection.execute
         self.parts_folder = path.with_suffix(".parts")
         # Further rows that SQLite takes before rows move; 0 before they are counted.
         self._room = 0
@@ -109,7 +110,7 @@ class Store:
 
     def meta(self, key: str) -> str:
         """The value of a metadata key; empty if it is not set."""
-        row = self.db.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
+        row = self.execute("SELECT value FROM meta WHERE key = ?", (key,)).fetchone()
         return self.checked(row, str)[0] if row else ""
 
     def overrides(self) -> dict[str, str]:
@@ -138,9 +139,9 @@ class Store:
                 number = "trial / {0} * {1} + trial % {0}".format(*grown)
                 for table in ("trials", "timings"):
                     # Negative numbers first, since a new number may be the old one of another row.
-                    self.db.execute(f"UPDATE {table} SET trial = -1 - ({number})")
-                    self.db.execute(f"UPDATE {table} SET trial = -1 - trial")
-            self.db.execute("DELETE FROM points")
+                    self.execute(f"UPDATE {table} SET trial = -1 - ({number})")
+                    self.execute(f"UPDATE {table} SET trial = -1 - trial")
+            self.execute("DELETE FROM points")
             self._insert_points(points)
             self.db.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
         self._near = NONE_NEAR
@@ -153,9 +154,7 @@ class Store:
         )
         with self.snapshot():
             found = [
-                row
-                for order in ("ASC", "DESC")
-                for row in self.db.execute(query.format(order))
+                row for order in ("ASC", "DESC") for row in self.execute(query.format(order))
             ]
             for part in self.parts():
                 part.trials(self._replicates())  # is as listed
@@ -170,7 +169,7 @@ class Store:
     def delete_failed(self) -> None:
         """Delete the failed trials, so that they are run again."""
         with self.db:
-            self.db.execute("DELETE FROM trials WHERE error IS NOT NULL")
+            self.execute("DELETE FROM trials WHERE error IS NOT NULL")
 
     def set_points(self, points: Iterable[Point], first: int = 0) -> None:
         """Insert or replace points, numbered from `first`."""
@@ -190,7 +189,7 @@ class Store:
 
     def points(self) -> list[Point]:
         """All points, in order. Raises InputError."""
-        rows = self.db.execute("SELECT levels, settings FROM points ORDER BY point")
+        rows = self.execute("SELECT levels, settings FROM points ORDER BY point")
         with self.corruption_as_input_error():
             return [Point(*self.checked(map(json.loads, row), dict, dict)) for row in rows]
 
@@ -215,7 +214,7 @@ class Store:
         No rows move without pyarrow, or before the study is known.
         """
         in_parts = sum(part.rows for part in self.parts())
-        count = self.db.execute("SELECT COUNT(*) FROM trials").fetchone()[0]
+        count = self.execute("SELECT COUNT(*) FROM trials").fetchone()[0]
         moved = PART_ROWS
         able = row_parts.can_write_parts() and bool(self.meta("replicates"))
         while able and in_parts + count > MOST_ROWS and count >= PART_ROWS == moved:
@@ -235,20 +234,20 @@ class Store:
         trial = columns.pop("trial")
         if len(trial) < PART_ROWS:
             return 0
-        number = 1 + self.db.execute("SELECT COALESCE(MAX(part), 0) FROM parts").fetchone()[0]
+        number = 1 + self.execute("SELECT COALESCE(MAX(part), 0) FROM parts").fetchone()[0]
         make_folder(self.parts_folder)
         row_parts.write_part(self.part_path(number), columns)
         last = (int(trial[-1]),)
         with self.db:
             ends = [int(columns["point"][row]) for row in (0, -1)]
             row = (number, len(trial), int(columns["wrong"].sum()), *ends)
-            self.db.execute("INSERT INTO parts VALUES (?, ?, ?, ?, ?)", row)
-            self.db.execute("DELETE FROM trials WHERE trial <= ? AND error IS NULL", last)
-            self.db.execute(
+            self.execute("INSERT INTO parts VALUES (?, ?, ?, ?, ?)", row)
+            self.execute("DELETE FROM trials WHERE trial <= ? AND error IS NULL", last)
+            self.execute(
                 "DELETE FROM timings WHERE trial <= ? AND trial NOT IN (SELECT trial FROM trials)",
                 last,
             )
-            self.db.execute(
+            self.execute(
                 "UPDATE meta SET value = ? WHERE key = 'format'", (str(FORMAT_OF_PARTS),)
             )
         return len(trial)
@@ -263,7 +262,7 @@ class Store:
         if self.meta("format") != str(FORMAT_OF_PARTS):
             return []
         # A last point that the study does not have is no integer here, which is refused.
-        rows = self.db.execute(
+        rows = self.execute(
             "SELECT part, rows, wrong, first, CASE WHEN typeof(last) = 'integer' AND last >= (SELECT COUNT(*) "
             "FROM points) THEN 'no point ' || last ELSE last END FROM parts ORDER BY part"
         )
@@ -279,7 +278,7 @@ class Store:
         if self.db.in_transaction:
             yield
             return
-        self.db.execute("BEGIN")
+        self.execute("BEGIN")
         try:
             yield
         finally:
@@ -289,13 +288,11 @@ class Store:
         """Record a finished run."""
         with self.db:
             row = (None, time.time() - seconds, engine, workers, trials, seconds)
-            self.db.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
+            self.execute("INSERT INTO runs VALUES (?, ?, ?, ?, ?, ?)", row)
 
     def runs(self) -> list[Record]:
         """Every run that was not killed: engine, workers, trials, seconds."""
-        rows = self.db.execute(
-            "SELECT engine, workers, trials, seconds FROM runs ORDER BY run"
-        )
+        rows = self.execute("SELECT engine, workers, trials, seconds FROM runs ORDER BY run")
         names = ("engine", "workers", "trials", "seconds")
         types = (str, int, int, float)
         return [dict(zip(names, self.checked(row, *types), strict=True)) for row in rows]
@@ -304,7 +301,7 @@ class Store:
         """(count,) mask of the trials in the store, failed ones included."""
         mask = np.zeros(count, bool)
         with self.snapshot():
-            rows = self.db.execute(
+            rows = self.execute(
                 "SELECT trial FROM trials WHERE trial >= 0 AND trial < ?", (count,)
             )
             mask[np.fromiter((trial for (trial,) in rows), np.int64)] = True
@@ -318,9 +315,7 @@ class Store:
         query = "SELECT COUNT(*), COALESCE(SUM(error IS NOT NULL), 0), COALESCE(SUM(wrong), 0) FROM trials"
         with self.snapshot():
             # SQLite's sum is an integer only if all values are.
-            done, failed, wrong = self.checked(
-                self.db.execute(query).fetchone(), int, int, int
-            )
+            done, failed, wrong = self.checked(self.execute(query).fetchone(), int, int, int)
             parts = self.parts()
         return {
             "done": done + sum(part.rows for part in parts),
@@ -330,7 +325,7 @@ class Store:
 
     def failures(self) -> list[tuple[int, str]]:
         """Number of each failed trial and the last line of its traceback. Raises InputError."""
-        rows = self.db.execute(
+        rows = self.execute(
             "SELECT trial, error FROM trials WHERE error IS NOT NULL ORDER BY trial"
         )
         with self.corruption_as_input_error():
@@ -388,7 +383,7 @@ class Store:
     def _ends(self) -> list[int]:
         """First and last trial number of SQLite and of each part."""
         with self.snapshot():
-            ends = [*self.db.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()]
+            ends = [*self.execute("SELECT MIN(trial), MAX(trial) FROM trials").fetchone()]
             for part in self.parts():
                 ends += part.trials(self._replicates())[[0, -1]].tolist()
         return [end for end in ends if end is not None]
@@ -428,7 +423,7 @@ class Store:
     def _kept_columns(self, where: str, values: Sequence[int]) -> dict[str, Array]:
         """The columns of rows in SQLite, in trial order."""
         query = f"SELECT {', '.join(COLUMNS)} FROM trials LEFT JOIN timings USING (trial) WHERE {where} ORDER BY trial"
-        cursor = self.db.execute(query, values)
+        cursor = self.execute(query, values)
         texts = dict[Any, Any]()
         columns = {name: [to_array(name, (), texts)] for name in COLUMNS}
         with self.corruption_as_input_error():
@@ -524,7 +519,7 @@ def open_store(path: Path) -> Iterator[Store]:
 def check_format(store: Store) -> None:
     """Raise InputError for a store of another format, or with a row that does not belong to its study."""
     # A run that the disk had no room for leaves an empty database.
-    found = store.db.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone()
+    found = store.execute("SELECT 1 FROM sqlite_master WHERE name = 'meta'").fetchone()
     stored = found and store.meta("format")
     if not stored:
         raise InputError(store.path, "contains no trials of a study", "to run the study")
@@ -536,7 +531,7 @@ def check_format(store: Store) -> None:
         )
     if stored not in (str(FORMAT), str(FORMAT_OF_PARTS)):
         raise InputError(store.path, f"format {stored!r}", f"{FORMAT}, {FORMAT_OF_PARTS}")
-    if stray := store.db.execute(STRAY).fetchone():
+    if stray := store.execute(STRAY).fetchone():
         raise InputError(store.path, *stray)
 
 

@@ -6,10 +6,9 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from skysim.core.errors import InputError
-from skysim.core.types import Floats
+from skysim.core.types import Array, Floats
 from skysim.experiments.study.plan import Map
 from skysim.experiments.study.report.figures import (
     HATCHED,
@@ -162,7 +161,7 @@ def cell_numbers(
     ranges: Sequence[tuple[float, float, float, float]],
     radial_deg: Floats,
     around_deg: Floats,
-) -> NDArray[np.int16]:
+) -> Array[np.int16]:
     """(N,) number of the cell that each trial is in, by the ranges of `partition`; -1 for none."""
     number = np.full(len(radial_deg), -1, np.int16)
     first = 0

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from skysim.core import files
-from skysim.core.errors import InputError, check_name
+from skysim.core.errors import check_name, refusing
+from skysim.core.types import Array
 from skysim.experiments.study.execution.store import COLUMNS, Store
 from skysim.experiments.study.table import level_columns, table, to_columns, with_levels
-from skysim.results.files.row_parts import EXTRA, Array, encoding, to_arrow
+from skysim.results.files.row_parts import EXTRA, encoding, to_arrow
 
 Names = tuple[str, ...]
 META = ("title", "code", "study")  # what the files say of the study
@@ -63,10 +64,8 @@ def to_parquet(store: Store, responses: Names, path: Path) -> None:
     InputError
         If pyarrow is not installed.
     """
-    try:
+    with refusing(ImportError, path, f"Parquet {EXTRA}"):
         import pyarrow.parquet
-    except ImportError:
-        raise InputError(path, f"Parquet {EXTRA}") from None
     levels = level_columns(store)
     meta = {key: store.meta(key) for key in META}
     tables = (
@@ -90,11 +89,9 @@ def to_zarr(store: Store, responses: Names, path: Path) -> None:
     The dimensions are the factors if the design is a full factorial, otherwise the points. Raises InputError if
     xarray or pandas is not installed.
     """
-    try:
+    with refusing(ImportError, path, f"xarray {EXTRA}"):
         import pandas
         import xarray
-    except ImportError:
-        raise InputError(path, f"xarray {EXTRA}") from None
     lines = table(store, responses)
     frame = pandas.DataFrame(to_columns(lines))
     factors = list(lines[0].levels) if lines else []

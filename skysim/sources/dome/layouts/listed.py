@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.random import Generator
 
-from skysim.core.errors import InputError, Where
+from skysim.core.errors import InputError, Where, errors_within
 from skysim.core.text import cells_of, column_numbers, read_lines
 from skysim.core.types import Floats, lengths, normalized
 from skysim.scene.sections.layouts import MAX_LEDS, ListedConfig, relative_levels
@@ -113,10 +113,8 @@ def read_csv(path: Path) -> LedFile:
     InputError
         With one line, and with the number of the wrong line.
     """
-    try:
+    with errors_within("light.layout.file"):
         rows = cells_of(read_lines(path))
-    except InputError as error:
-        raise error.within("light.layout.file") from None
     names = rows[0][1] if rows else []
     allowed = {**PLACES, ANGLES: 1.0}
     chosen = next((columns for columns in allowed if {*columns} <= {*names}), None)
