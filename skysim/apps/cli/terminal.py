@@ -126,11 +126,20 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     ]
     rows = [
         [
-            *line[:2],
+            line.tracker,
+            line.frames,
             100 * line.right.value,
             f"{100 * line.right.low:.1f} to {100 * line.right.high:.1f}",
             Cell(str(line.wrong), "bad" if line.wrong else ""),
-            *line[4:-1],
+            line.refused,
+            line.failed,
+            line.cross_arcsec_median,
+            line.cross_arcsec_worst,
+            line.roll_arcsec_median,
+            line.roll_arcsec_worst,
+            line.nees,
+            line.time_ms_median,
+            line.time_ms_p95,
         ]
         for line in lines
     ]
