@@ -71,7 +71,9 @@ AREAS = {
     "scale_rates": Area("frames, trials and closed loops a second on two cores"),
     "scale_frame_cost": Area("a model of what a labelled frame costs"),
     "scale_store": Area("reports and exports of ten million rows"),
-    "scale_domes": Area("places and pairs of a dome's LEDs as their number grows"),
+    "scale_domes": Area(
+        "places, index and identification of a dome's LEDs as their number grows"
+    ),
     "scale_coordination": Area("chunks a second that a study hands out to 64 workers"),
     "lab": Area("the page in Chromium: frames a second, latency, memory, a crowd of tabs"),
 }

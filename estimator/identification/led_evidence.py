@@ -16,18 +16,23 @@ focal length is uncertain, it is refined with the attitude: `focal_ratio` is the
 
 The steps of `evaluate`; the same numbers return as comments in the code:
 
-1. Match the LEDs around to the detections, within the error of the pair's attitude (`_match`).
+1. Match the LEDs of the field to the detections, within the error of the pair's attitude (`_match`).
 2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).
-3. Match again, within the errors of the detections alone, and count the missing LEDs.
-4. Compute the evidence (`_evidence`). Steps 2 to 4 are done twice.
+3. Match again, within the errors of the detections alone, and count the missing LEDs. Steps 2 and 3 are done twice.
+4. Compute the evidence (`_evidence`).
+
+Under a dense dome a near pair determines no attitude for the whole field. The LEDs near `center` are matched and
+fitted twice before, within the errors of the pair and then of the first fit. A part with more missing LEDs than matches
+is none.
 """
 
-from math import exp, log, log10, pi
+from math import exp, log, log10, pi, sqrt
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimator.catalog.sky_index import within
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -63,15 +68,18 @@ class LedHypothesis(NamedTuple):
 
 
 @jit
-def same_identification(first: LedHypothesis, second: LedHypothesis) -> bool:
-    """Whether two hypotheses agree: more than half of the matches of the smaller one are also in the other."""
-    common = 0
-    for n in range(len(first.observed)):
-        for m in range(len(second.observed)):
-            common += (
-                first.observed[n] == second.observed[m] and first.star[n] == second.star[m]
-            )
-    return 2 * common > min(len(first.observed), len(second.observed))
+def shared_matches(
+    first: LedHypothesis, second: LedHypothesis, lights: int
+) -> tuple[int, int]:
+    """Numbers of lights that two hypotheses both match, and that they match to the same LED."""
+    star = np.full(lights, -1)
+    star[first.observed] = first.star
+    both = same = 0
+    for n in range(len(second.observed)):
+        other = star[second.observed[n]]
+        both += other >= 0
+        same += other == second.star[n]
+    return both, same
 
 
 @jit
@@ -91,7 +99,7 @@ def evaluate(
     R_cam_from_lab
         (3, 3) candidate attitude, changed in place by the fit
     center
-        Row of the LED whose neighborhood is matched
+        Row of the first LED of the pair, whose neighborhood is matched first under a dense dome
     a, b
         Rows of the pair's detections
     focal_ratio
@@ -100,46 +108,64 @@ def evaluate(
     Returns
     -------
     LedHypothesis
-        Its evidence is -inf if fewer than MIN_EVIDENCE_MATCHES LEDs match, or if the focal length is out of its range
+        Its evidence is -inf if too few LEDs match, or if the focal length is out of its range
     """
-    # 1. Match.
     # Error of the pair's attitude, in units of a detection's variance: 1/2 from the midpoint (added to the detection's
     # own 1), and 2 / separation^2 from the direction, per squared distance from the midpoint; a focal length from the
     # pair adds the same along that distance.
     midpoint = middle(detections.tangent, a, b)
     direction_variance = 2 / separation(detections.tangent, a, b) ** 2
-    observed, star, missing = _match(
-        detections,
-        dome,
-        R_cam_from_lab,
-        focal_ratio,
-        center,
-        midpoint,
-        1.5,
-        direction_variance,
-    )
-    for _ in range(2):
-        dex = -np.inf
-        # Too few matches determine no attitude.
-        if len(observed) < MIN_EVIDENCE_MATCHES:
+    base_variance = 1.5
+    dense = len(dome.near) > 0
+    leds = _field(dome, R_cam_from_lab)
+    for step in range(4 if dense else 3):
+        # The first two matches under a dense dome are those of a part.
+        part = dense and step < 2
+        if part:
+            leds = dome.near[center]
+        elif step == 2:
+            leds = _field(dome, R_cam_from_lab)
+        # 1. and 3. Match.
+        observed, star, missing = _match(
+            detections,
+            dome,
+            R_cam_from_lab,
+            focal_ratio,
+            leds,
+            midpoint,
+            base_variance,
+            direction_variance,
+        )
+        # Too few matches determine no attitude, or no part.
+        if len(observed) < max(MIN_EVIDENCE_MATCHES, part * missing):
+            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+        if step == 2 + dense:
             break
         # 2. Fit; the range of the focal ratio has a margin, as the fit is noisy.
         info, focal_ratio = _fit(
             detections, dome, R_cam_from_lab, focal_ratio, observed, star
         )
         if abs(focal_ratio - 1) > 1.2 * detections.focal_uncertainty + 1e-12:
-            break
-        # 3. Match again.
-        observed, star, missing = _match(
-            detections, dome, R_cam_from_lab, focal_ratio, center, midpoint, 1.0, 0.0
-        )
-        # 4. The evidence.
-        dex = _evidence(
-            detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info
-        )
-    if len(observed) < MIN_EVIDENCE_MATCHES:
-        dex = -np.inf
+            return LedHypothesis(observed, star, R_cam_from_lab, -np.inf)
+        # The error of a part's fit, as above, is 1 / K and 1 / (sum of squared distances), that of the field's small.
+        base_variance = 1 + 2 * part / len(observed)
+        offset = detections.tangent[observed] - np.array(midpoint)
+        direction_variance = part / np.sum(offset**2)
+    # 4. The evidence.
+    dex = _evidence(
+        detections, dome, R_cam_from_lab, focal_ratio, observed, star, missing, info
+    )
     return LedHypothesis(observed, star, R_cam_from_lab, dex)
+
+
+@jit
+def _field(dome: DomeIndex, R_cam_from_lab: Floats) -> NDArray[np.int64]:
+    """Rows of the LEDs in the field, and of some around it."""
+    index = dome.pairs
+    leds = np.empty(len(index.vectors), np.int64)
+    # The third row of the rotation is the boresight.
+    x, y, z = vectors.row(R_cam_from_lab, 2)
+    return leds[: within(index.cells, index.vectors, x, y, z, dome.reach, leds)]
 
 
 @jit
@@ -155,19 +181,19 @@ def _match(
     dome: DomeIndex,
     R_cam_from_lab: Floats,
     focal_ratio: float,
-    center: int,
+    leds: NDArray[np.int64],
     midpoint: tuple[float, float],
     base_variance: float,
     direction_variance: float,
 ) -> tuple[NDArray, NDArray, int]:
-    """Match each LED near `center` to its nearest detection within the gate, one LED for each detection: steps 1 and 3.
+    """Match each of (K,) LEDs to its nearest detection within the gate, one LED for each detection: steps 1 and 3.
 
     The squared gate is GATE_SIGMA^2 (base_variance + direction_variance d^2), d the distance from `midpoint`.
 
     Parameters
     ----------
-    center, midpoint
-        Row of an LED, which is matched with its neighbors in the pair index, and (x, y) of the pair, tangents
+    leds, midpoint
+        Rows of the LEDs, and (x, y) of the pair, tangents
     base_variance, direction_variance
         Error of the attitude and of the detection, in units of the detection's variance
 
@@ -179,14 +205,13 @@ def _match(
         Number of missing LEDs: predicted well inside the field, or rivals for a detection that a nearer LED keeps
     """
     left, right, top, bottom = dome.field_tan
-    first = dome.pairs.first
-    count = missing = 0
-    observed = np.empty(len(detections.ray), np.int64)
-    star = np.empty_like(observed)
-    distances2 = np.empty(len(observed))
-    # The LED `center` itself, then its neighbors in the pair index: all LEDs that can share a field with it.
-    for entry in range(first[center] - 1, first[center + 1]):
-        s = center if entry < first[center] else dome.pairs.neighbor[entry]
+    total = len(detections.ray)
+    missing = 0
+    star = np.full(total, -1)
+    distances2 = np.full(total, np.inf)
+    across = detections.tangent[:, 0]
+    widest = detections.sigma.max()
+    for s in leds:
         qx, qy, qz = _vector_from_pupil(dome, R_cam_from_lab, s)
         if qz <= 0:
             continue
@@ -197,26 +222,28 @@ def _match(
             continue
         offset2 = (x - midpoint[0]) ** 2 + (y - midpoint[1]) ** 2
         gate2 = GATE_SIGMA**2 * (base_variance + direction_variance * offset2)
+        begin = 0
+        end = total
+        # Lights are sorted from left to right under a dense dome.
+        if len(dome.near) > 0:
+            reach = sqrt(gate2) * widest
+            begin = int(np.searchsorted(across, x - reach))
+            end = int(np.searchsorted(across, x + reach))
         best, distance2 = _nearest_detection(
-            detections.tangent, detections.sigma, x, y, gate2
+            detections.tangent[begin:end], detections.sigma[begin:end], x, y, gate2
         )
         if best < 0:
             # A missing LED counts only well inside the field.
             missing += left < x < right and top < y < bottom
             continue
-        # The slot of an earlier match of the same detection, or a new one at the end.
-        slot = 0
-        while slot < count and observed[slot] != best:
-            slot += 1
-        if slot < count:
-            missing += 1  # two LEDs match one detection: the farther one is missing
-            if distance2 >= distances2[slot]:
-                continue
-        observed[slot] = best
-        star[slot] = s
-        distances2[slot] = distance2
-        count = max(count, slot + 1)
-    return observed[:count], star[:count], missing
+        # Two LEDs match one detection: the farther one is missing.
+        best += begin
+        missing += star[best] >= 0
+        if distance2 < distances2[best]:
+            star[best] = s
+            distances2[best] = distance2
+    observed = np.flatnonzero(star >= 0)
+    return observed, star[observed], missing
 
 
 @jit

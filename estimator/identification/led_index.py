@@ -1,48 +1,29 @@
-"""Index of a dome's LEDs for identification: pairs by the angle between them, and LEDs by direction.
+"""Index of a dome's LEDs for identification: pairs by the angle between them, and the nearest LEDs of each.
 
 Angles are measured about the bearing center, from which they do not change with the attitude. They are scaled to those
 that LEDs at the median radius would have; the search allows for the error of that scaling. Pairs are sorted by angle,
-with a k-vector to find a range of angles. Directions are sorted into a square grid around the middle of the dome, so
-that the question "is an LED near this direction" reads a few cells.
+with a k-vector to find a range of angles.
+
+All pairs that a field can hold grow with the square of the number of LEDs. Of a dense dome the index has near pairs
+only, and the chords from each LED to its nearest ones, so that it grows in proportion.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+from scipy.spatial import cKDTree
 
 from estimator.attitude.dome_map import LedMap, Lever
 from estimator.catalog.pair_index import PairIndex, build, k_vector
-from estimator.catalog.sky_index import cell_of
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints
-from estimator.core.jit import jit
-from estimator.core.vectors import Vector, row, squared_chord
 
 # Fraction of the field in which an unmatched LED counts as missing; nearer to the border it may be cut off.
 INNER_FRACTION = 0.95
-
-
-class DirectionGrid(NamedTuple):
-    """LED directions in a square grid of side * side cells over their x and y components.
-
-    Attributes
-    ----------
-    R_grid_from_lab
-        (3, 3) rotation of the mean direction of the LEDs to +z
-    cell, side
-        Width of a cell, and number of cells along a side
-    first
-        (side^2 + 1,) LEDs first[c] to first[c + 1] are in cell c
-    direction
-        (L, 3) unit vectors of the LEDs in that order, in grid axes
-    """
-
-    R_grid_from_lab: Floats
-    cell: float
-    side: int
-    first: Ints
-    direction: Floats
+# A dome of more LEDs, with more pairs of LEDs that one field can hold, is dense: the pairs of an angle are too many.
+PAIRED_LEDS = 2500
+MOST_PAIRS = 1_000_000
+PART = 24  # LEDs of a part of a dense dome: one and its nearest ones
 
 
 class DomeIndex(NamedTuple):
@@ -52,8 +33,11 @@ class DomeIndex(NamedTuple):
     ----------
     pairs
         LED pairs by their angle about the bearing, scaled to the median radius (`scale_pair_angles`)
-    grid
-        The LEDs by direction
+    near, near_chord
+        (L, PART) rows of each LED and of its nearest ones, and their increasing chords from it, scaled like pair
+        angles, of a dense dome, whose index has pairs of near LEDs only; of length 0 if it has all pairs of a field
+    reach
+        Chord about the bearing, from the direction of the boresight to beyond the field's corners
     position_m
         (L, 3) positions of the LEDs in the lab frame
     radius_m
@@ -79,7 +63,9 @@ class DomeIndex(NamedTuple):
     """
 
     pairs: PairIndex
-    grid: DirectionGrid
+    near: Ints
+    near_chord: Floats
+    reach: float
     position_m: Floats
     radius_m: Floats
     median_radius_m: float
@@ -118,7 +104,11 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     alpha = float(np.arccos(rays[:, 2].min()))
     # At a given angle from the boresight, the LED of the greatest radius has the greatest angle about the bearing.
     theta = alpha - np.arcsin(min(lever_m / radius.max() * np.sin(alpha), 1.0))
-    index = build(leds.position_m / radius[:, None], min(2.1 * theta, np.pi), leds.board)
+    directions = leds.position_m / radius[:, None]
+    widest = min(2.1 * theta, np.pi)
+    near, near_chord = near_leds(directions, widest)
+    longest = float(np.median(near_chord[:, -1])) if len(near) else widest
+    index = build(directions, longest, leds.board)
     # Scale the angles to the median radius, and bound the error of that.
     scale = (median_m - lever_m) / median_m * radius / (radius - lever_m)
     first, second = index.pair.T
@@ -128,7 +118,9 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
     scaling_error = 1.5 * max_difference_m * lever_m * alpha / radius.min() ** 2
     return DomeIndex(
         scale_pair_angles(index, scale),
-        build_grid(index.vectors),
+        near,
+        near_chord * (scale[: len(near), None] + scale[near]) / 2,
+        float(2 * np.sin(0.55 * theta) + np.hypot(*lever.pupil_cam_m[:2]) / radius.min()),
         np.ascontiguousarray(leds.position_m, dtype=float),
         radius,
         median_m,
@@ -136,12 +128,32 @@ def build_dome_index(leds: LedMap, lever: Lever, camera: Camera) -> DomeIndex:
         float(scaling_error),
         inner,
         float(4 * half_size[0] * half_size[1]),
-        (2 * np.pi) ** 2 * cap_height(leds.position_m / radius[:, None], theta),
+        (2 * np.pi) ** 2 * cap_height(directions, theta),
         float(leds.sigma_m / (radius.min() - lever_m)),
         float(lever.sigma_m / (radius.min() - lever_m)),
         np.zeros(0) if leds.flux_s is None else np.log(leds.flux_s),
         float(leds.flux_sigma),
     )
+
+
+def near_leds(directions: Floats, widest_rad: float) -> tuple[Ints, Floats]:
+    """The fields `near` and `near_chord` of DomeIndex, with chords that are not scaled.
+
+    All pairs of a field grow with the square of the number of LEDs, those of near LEDs in proportion.
+
+    Parameters
+    ----------
+    directions
+        (L, 3) unit vectors of the LEDs
+    widest_rad
+        Greatest angle between two LEDs in one field
+    """
+    count = len(directions)
+    pairs = count**2 / 2 * (1 - np.cos(widest_rad)) / cap_height(directions, 0.0)
+    if count <= PAIRED_LEDS or pairs < MOST_PAIRS:
+        directions = directions[:0]
+    chord, near = cKDTree(directions).query(directions, PART)
+    return near, chord
 
 
 def inner_field(corners: Floats) -> tuple[Floats, Floats]:
@@ -165,27 +177,6 @@ def inner_field(corners: Floats) -> tuple[Floats, Floats]:
     return np.array(
         [mean - INNER_FRACTION * half_size, mean + INNER_FRACTION * half_size]
     ).T.ravel(), half_size
-
-
-def build_grid(directions: Floats) -> DirectionGrid:
-    """Grid of (L, 3) unit vectors, with one vector in a cell on average."""
-    # Turn the mean direction to +z, so that x and y tell the LEDs apart.
-    mean = directions.mean(axis=0)
-    R_grid_from_lab = Rotation.align_vectors([[0.0, 0.0, 1.0]], [mean])[0].as_matrix()
-    in_grid = directions @ R_grid_from_lab.T
-    flat = in_grid[:, :2]
-    # A square that holds all LEDs, with one cell for each LED.
-    half_size = np.abs(flat).max() * 1.001
-    side = max(int(np.sqrt(len(flat))), 1)
-    cell = 2 * half_size / side
-    # Sort the LEDs by cell.
-    column, row = ((flat + half_size) / cell).astype(np.int64).T
-    number = row * side + column
-    order = np.argsort(number, kind="stable")
-    first = np.searchsorted(number[order], np.arange(side * side + 1))
-    return DirectionGrid(
-        R_grid_from_lab, float(cell), side, first, np.ascontiguousarray(in_grid[order])
-    )
 
 
 def scale_pair_angles(index: PairIndex, scale: Floats) -> PairIndex:
@@ -219,32 +210,3 @@ def cap_height(directions: Floats, margin_rad: float) -> float:
     # Cosine of the angle of the LED farthest from the mean.
     nearest = (directions @ mean).min() / max(np.linalg.norm(mean), 1e-9)
     return float(1 - np.cos(min(np.arccos(np.clip(nearest, -1, 1)) + margin_rad, np.pi)))
-
-
-@jit
-def has_led_near(grid: DirectionGrid, direction: Vector, gate: float) -> bool:
-    """Whether any LED is near a direction.
-
-    Parameters
-    ----------
-    direction
-        Unit vector in grid axes
-    gate
-        Greatest distance, rad
-    """
-    inverse = 1 / grid.cell
-    half = grid.side / 2
-    reach = gate / grid.cell
-    # Place in units of cells.
-    x = direction[0] * inverse + half
-    y = direction[1] * inverse + half
-    # The cells that a square of this half-width about the direction meets; those of a line are contiguous.
-    for line in range(cell_of(y - reach, grid.side), cell_of(y + reach, grid.side - 1) + 1):
-        left = line * grid.side + cell_of(x - reach, grid.side)
-        right = line * grid.side + cell_of(x + reach, grid.side - 1)
-        if left > right:
-            continue
-        for place in range(grid.first[left], grid.first[right + 1]):
-            if squared_chord(row(grid.direction, place), direction) < gate * gate:
-                return True
-    return False

@@ -18,6 +18,22 @@ The steps; the same numbers return as comments in the code:
    pair that shares no detection with it. A rival that explains almost as much must contain one of the two pairs.
 8. Refuse an attitude that a rival approaches within MARGIN_DEX, or that is not beyond chance (`identify`).
 
+A dense dome (`led_index`) has too many pairs of any angle, and parts of a regular one are alike: a lattice whose cells
+change slowly differs from its neighborhood by its spacing times the angle that is compared. So parts of a field only
+propose attitudes, and the whole field decides. The steps that differ:
+
+2. Take a detection, from the boresight outward, with its PATTERN nearest ones (`_search_parts`).
+3. Find the LEDs that it may be, with chords c_k to their nearest ones like those of the detections, d_k
+   (`part_pairs`): sum_k (c_k - d_k)^2 <= 4 gate^2, where gate = GATE_SIGMA 2^(1/2) sigma. The sum's mean is
+   2 PATTERN sigma^2; half of it is the detection's own error, which all chords share, so that the sum scatters widely.
+   Each LED forms pairs with those near it that are as far as the farthest of the detections.
+5. Look for an LED at the direction of these detections only.
+6. Match and fit the LEDs of the part, then those of the field, of which the Bayes factor is (`led_evidence.evaluate`).
+   It has the volume of all attitudes, so that it needs no penalty for the number of parts.
+7. Another part of the field, far from the first, must find the same attitude. A part with a stray light or a dark LED
+   finds nothing, and would find no rival either. If no two parts do, try again with LEDs of any pattern, and with
+   more stray lights.
+
 If the focal length is uncertain, an angle alone says little. Angles of triangles in the focal plane hardly depend on
 it (Samaan, Mortari & Junkins 2003, AAS 03-131: non-dimensional star identification; Leake, Arnas & Mortari 2020,
 arXiv:2003.13736). A pair of detections is then compared with all LED pairs of any angle in its range. Each LED pair
@@ -32,6 +48,7 @@ from numpy.typing import NDArray
 
 from estimator.attitude.solvers import rotation
 from estimator.catalog.pair_index import pair_range
+from estimator.catalog.sky_index import nearest
 from estimator.core import vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
@@ -44,20 +61,29 @@ from estimator.identification.chance import (
     SHORT_PAIR,
     attitude_dex,
     least,
-    middle,
     required_matches,
     separation,
 )
-from estimator.identification.led_detections import LedDetections, build_detections
-from estimator.identification.led_evidence import (
-    LedHypothesis,
-    evaluate,
-    same_identification,
+from estimator.identification.led_detections import (
+    PATTERN,
+    LedDetections,
+    bearing_angle_ratio,
+    build_detections,
+    direction_from_bearing,
+    pair_gates,
+    part_pairs,
 )
-from estimator.identification.led_index import DomeIndex, has_led_near
+from estimator.identification.led_evidence import LedHypothesis, evaluate, shared_matches
+from estimator.identification.led_index import DomeIndex
 from estimator.identification.refusals import AMBIGUOUS, NO_MATCH
 from estimator.identification.star_detections import ray
 
+# Of a dense dome: parts of a field that are tried; lights of a part that may be no LEDs, in the first attempt and in
+# the second; attitudes that are evaluated
+PARTS = 16
+STRAYS = 2
+MOST_STRAYS = 6
+MOST_ALIKE = 40
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
 MIN_SEPARATION = (
@@ -72,6 +98,7 @@ def identify(
     max_checks: int = 4_000_000,
     flux_s: Floats | None = None,
     focal_uncertainty: float = 0.0,
+    most_lights: int | None = None,
 ) -> StarMatch | str:
     """Identify the LEDs of (N, 3) rays in camera axes: the whole search (see the module's steps).
 
@@ -90,6 +117,8 @@ def identify(
         brightness
     focal_uncertainty
         Greatest relative error of the focal length; `dome` must hold the pairs of the widest field
+    most_lights
+        Number of lights that are used, the first ones; None: all, as always under a dense dome
 
     Returns
     -------
@@ -98,17 +127,25 @@ def identify(
     """
     if len(rays_cam) < MIN_EVIDENCE_MATCHES:
         return NO_MATCH
+    # The first lights, or of a dense dome all, from left to right as `evaluate` needs them.
+    order = np.arange(len(rays_cam))[:most_lights]
+    if len(dome.near):
+        order = np.argsort(rays_cam[:, 0] / rays_cam[:, 2])
+    flux_s = None if flux_s is None else flux_s[order]
     # 1. Directions from the bearing.
-    detections = build_detections(rays_cam, sigma_rad, dome, flux_s, focal_uncertainty)
+    detections = build_detections(
+        rays_cam[order], sigma_rad[order], dome, flux_s, focal_uncertainty
+    )
     # 2. to 7. The best attitude, and the evidence of its best rival.
-    hypothesis, rival_dex = _search(detections, dome, max_checks)
+    search = _search_parts if len(dome.near) else _search
+    hypothesis, rival_dex = search(detections, dome, max_checks)
     # 8. Refuse an ambiguous or insignificant one.
     if hypothesis.dex > AMBIGUOUS_DEX and hypothesis.dex - rival_dex < MARGIN_DEX:
         return AMBIGUOUS
     if hypothesis.dex < ACCEPT_DEX:
         return NO_MATCH
     return StarMatch(
-        hypothesis.observed,
+        order[hypothesis.observed],
         hypothesis.star,
         rotation(hypothesis.R_cam_from_lab),
         -hypothesis.dex,
@@ -128,8 +165,7 @@ def _search(
     rival_dex
         Evidence of the strongest rival, which is the best hypothesis with a different attitude; log10
     """
-    none = np.empty(0, np.int64)
-    best = LedHypothesis(none, none, np.eye(3), -np.inf)
+    best = _nothing()
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
     # 2. The order of the pairs.
@@ -206,7 +242,7 @@ def _pair_range(
     gate = (
         GATE_SIGMA
         * sqrt(detections.sigma[a] ** 2 + detections.sigma[b] ** 2)
-        * _bearing_angle_ratio(dome)
+        * bearing_angle_ratio(dome)
     )
     direction_a = vectors.row(detections.direction, a)
     direction_b = vectors.row(detections.direction, b)
@@ -223,12 +259,6 @@ def _pair_range(
 
 
 @jit
-def _bearing_angle_ratio(dome: DomeIndex) -> float:
-    """Ratio of a small angle about the bearing to that seen by the camera: (R - M) / R, M the length of the lever."""
-    return 1 - vectors.norm(dome.pupil_m) / dome.median_radius_m
-
-
-@jit
 def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
     """Rank of the first pair of two matched detections that shares none with pair `rank`, or else as few as possible.
 
@@ -239,19 +269,12 @@ def _disjoint_pair(pairs: NDArray, rank: int, best: LedHypothesis) -> int:
     best
         The hypothesis that matches them
     """
-    best_rank = rank
-    cost = 9
-    for other in range(len(pairs)):
-        penalty = 0
-        for end in range(2):
-            # Each end costs 3 if it is not matched, and 1 if it is shared.
-            light = pairs[other, end]
-            penalty += 3 * (not (best.observed == light).any())
-            penalty += light == pairs[rank, 0] or light == pairs[rank, 1]
-        if penalty < cost:
-            best_rank = other
-            cost = penalty
-    return best_rank
+    # Each end costs 3 if it is not matched, and 1 if it is shared.
+    cost = np.full(max(pairs.max(), best.observed.max()) + 1, 3)
+    cost[best.observed] = 0
+    cost[pairs[rank, 0]] += 1
+    cost[pairs[rank, 1]] += 1
+    return int(np.argmin(cost[pairs[:, 0]] + cost[pairs[:, 1]]))
 
 
 @jit
@@ -270,7 +293,7 @@ def _test_pair(
     Parameters
     ----------
     a, b
-        Rows of the two detections
+        Rows of the two detections; under a dense dome of one, and whether its LED must have its pattern
     min_dex
         Candidates that cannot reach this evidence are skipped
     best, rival_dex
@@ -279,60 +302,123 @@ def _test_pair(
         (1,) effort so far, increased in place
     """
     index = dome.pairs
-    radius = dome.radius_m
+    rows = np.arange(len(detections.ray))
     # 3. LED pairs of the same angle, and what the quick check needs.
-    begin, end, gate = _pair_range(detections, dome, a, b)
-    required = _required_matches(detections, dome, a, b, min_dex)
-    gates = _pair_gates(detections, dome, a, b)
+    if len(dome.near) > 0:
+        offset = detections.direction - detections.direction[a]
+        rows = np.argsort((offset**2).sum(axis=1))[: PATTERN + 1]
+        required = PATTERN + 1 - (STRAYS if b > 0 else MOST_STRAYS)
+        pairs, gate = part_pairs(detections, dome, rows, b > 0)
+        b = rows[-1]
+    else:
+        begin, end, gate = _pair_range(detections, dome, a, b)
+        required = _required_matches(detections, dome, a, b, min_dex)
+        pairs = np.empty((2 * (end - begin), 2), np.int32)
+        pairs[::2] = index.pair[begin:end]
+        pairs[1::2] = index.pair[begin:end, ::-1]
+    gates = pair_gates(detections, dome, a, b)
     in_cam = np.empty((3, 3))
     in_lab = np.empty((3, 3))
     R_cam_from_lab = np.empty((3, 3))
-    R_grid_from_cam = np.empty((3, 3))
-    checks[0] += 2 * (end - begin)
-    for p in range(begin, end):
-        for flip in range(2):
-            i = index.pair[p, flip]
-            j = index.pair[p, 1 - flip]
-            # 4. The attitude.
-            focal_ratio = _pair_attitude(
-                detections, dome, a, b, i, j, gate, in_cam, in_lab, R_cam_from_lab
-            )
-            if not focal_ratio > 0:
-                continue
-            # 5. Quick check.
-            vectors.multiply_transposed(
-                dome.grid.R_grid_from_lab, R_cam_from_lab, R_grid_from_cam
-            )
-            counted = _quick_check(
-                detections,
-                dome,
-                R_grid_from_cam,
-                focal_ratio,
-                radius[i],
-                a,
-                b,
-                gates,
-                required,
-            )
-            if counted < required:
-                continue
-            # 6. Evidence.
-            checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
-            hypothesis = evaluate(
-                detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio
-            )
-            best, rival_dex = _better(hypothesis, best, rival_dex)
+    checks[0] += len(pairs)
+    alike = 0
+    for p in range(len(pairs)):
+        i = pairs[p, 0]
+        j = pairs[p, 1]
+        # 4. The attitude.
+        focal_ratio = _pair_attitude(
+            detections, dome, a, b, i, j, gate, in_cam, in_lab, R_cam_from_lab
+        )
+        if not focal_ratio > 0:
+            continue
+        # 5. Quick check.
+        counted = _quick_check(
+            detections,
+            dome,
+            R_cam_from_lab.T,
+            focal_ratio,
+            dome.radius_m[i],
+            a,
+            b,
+            gates,
+            rows,
+            required,
+        )
+        if counted < required:
+            continue
+        # 6. Evidence.
+        checks[0] += len(detections.ray) * (index.first[i + 1] - index.first[i]) // 4
+        hypothesis = evaluate(detections, dome, R_cam_from_lab.copy(), i, a, b, focal_ratio)
+        best, rival_dex = _better(hypothesis, best, rival_dex, detections)
+        # Too many places of a regular dome are alike.
+        alike += hypothesis.dex > -np.inf
+        if alike > MOST_ALIKE and len(dome.near) > 0:
+            return best, np.inf
     return best, rival_dex
 
 
 @jit
 def _better(
-    hypothesis: LedHypothesis, best: LedHypothesis, rival_dex: float
+    hypothesis: LedHypothesis,
+    best: LedHypothesis,
+    rival_dex: float,
+    detections: LedDetections,
 ) -> tuple[LedHypothesis, float]:
-    """The better of two hypotheses, and the evidence of the best one with another identification."""
-    if not same_identification(hypothesis, best):
-        rival_dex = max(rival_dex, min(hypothesis.dex, best.dex))
+    """The better of two hypotheses, and the evidence of the best one with another identification.
+
+    Identifications agree if more than half of the matches of the smaller one are also in the other.
+
+    A rival beyond chance is a place that is alike, and the errors of the map may decide between the two. GATE_SIGMA
+    standard deviations of the difference, `LedDetections.blur_dex` times the root of the number of lights that both
+    match, are added to its evidence.
+    """
+    both, same = shared_matches(hypothesis, best, len(detections.ray))
+    if 2 * same <= min(len(hypothesis.observed), len(best.observed)):
+        dex = min(hypothesis.dex, best.dex)
+        if dex > ACCEPT_DEX:
+            dex += GATE_SIGMA * detections.blur_dex * sqrt(both)
+        rival_dex = max(rival_dex, dex)
     return (hypothesis if hypothesis.dex > best.dex else best), rival_dex
+
+
+@jit
+def _nothing() -> LedHypothesis:
+    """A hypothesis without matches."""
+    none = np.empty(0, np.int64)
+    return LedHypothesis(none, none, np.eye(3), -np.inf)
+
+
+@jit
+def _search_parts(
+    detections: LedDetections, dome: DomeIndex, max_checks: int
+) -> tuple[LedHypothesis, float]:
+    """Steps 2 to 7 of a dense dome, like `_search`; the best attitude is its own rival if no other part agrees."""
+    best = _nothing()
+    rival_dex = -np.inf
+    checks = np.zeros(1, np.int64)
+    # 2. The order of the parts: from the boresight outward, then again, with LEDs of any pattern.
+    order = np.argsort((detections.tangent**2).sum(axis=1))
+    order = order[:: len(order) // (2 * PARTS) + 1][: PARTS * (len(order) > PATTERN)]
+    last = -1
+    for turn in range(2 * len(order)):
+        a = order[turn % len(order)]
+        apart = last < 0 or (
+            separation(detections.tangent, a, last) > SHORT_PAIR * sqrt(dome.field_area)
+        )
+        if apart and checks[0] < max_checks:
+            # 3. to 6. Test the part.
+            by_pattern = int(turn < len(order))
+            found, found_rival_dex = _test_pair(
+                detections, dome, a, by_pattern, 0.0, _nothing(), -np.inf, checks
+            )
+            # 7. Another part that finds the same, or a place that is alike.
+            _, same = shared_matches(found, best, len(detections.ray))
+            rival_dex = max(rival_dex, found_rival_dex)
+            best, rival_dex = _better(found, best, rival_dex, detections)
+            if 2 * same > len(found.observed) or rival_dex > max(best.dex - MARGIN_DEX, 0.0):
+                return best, rival_dex
+            last = a if found.dex >= ACCEPT_DEX else last
+    return best, best.dex
 
 
 @jit
@@ -370,8 +456,8 @@ def _pair_attitude(
     focal_ratio = _fit_focal_ratio(detections, dome, a, b, radius_i, radius_j, chord)
     if abs(focal_ratio - 1) > detections.focal_uncertainty:
         return np.nan
-    direction_a = _direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius_i)
-    direction_b = _direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius_j)
+    direction_a = direction_from_bearing(_ray(detections, a, focal_ratio), dome, radius_i)
+    direction_b = direction_from_bearing(_ray(detections, b, focal_ratio), dome, radius_j)
     # 4b. Compare the angle. The index holds angles scaled to the median radius; here each ray meets the LED's own
     # radius.
     if abs(vectors.chord(direction_a, direction_b) - chord) > gate:
@@ -416,46 +502,14 @@ def _fit_focal_ratio(
     if detections.focal_uncertainty > 0:
         # f <- f chord(f) / chord of the LEDs
         for _ in range(3):
-            direction_a = _direction_from_bearing(
+            direction_a = direction_from_bearing(
                 _ray(detections, a, focal_ratio), dome, radius_a_m
             )
-            direction_b = _direction_from_bearing(
+            direction_b = direction_from_bearing(
                 _ray(detections, b, focal_ratio), dome, radius_b_m
             )
             focal_ratio *= vectors.chord(direction_a, direction_b) / chord
     return focal_ratio
-
-
-@jit
-def _direction_from_bearing(ray: Vector, dome: DomeIndex, radius_m: float) -> Vector:
-    """Direction from the bearing to the point where a camera ray meets a sphere, in camera axes.
-
-    The point is p = r + s u, s = -u . r + sqrt((u . r)^2 - r . r + R^2), with the pupil r, the ray u and the radius R.
-
-    Parameters
-    ----------
-    ray
-        Unit ray in camera axes
-    radius_m
-        Radius of the sphere about the bearing
-
-    Returns
-    -------
-    Vector
-        Unit vector p / R
-    """
-    px, py, pz = dome.pupil_m
-    # u . r, then the distance s along the ray.
-    along = vectors.dot(ray, dome.pupil_m)
-    distance = -along + sqrt(
-        max(along * along - px * px - py * py - pz * pz + radius_m * radius_m, 0.0)
-    )
-    inverse = 1 / radius_m
-    return (
-        (px + distance * ray[0]) * inverse,
-        (py + distance * ray[1]) * inverse,
-        (pz + distance * ray[2]) * inverse,
-    )
 
 
 @jit
@@ -479,40 +533,16 @@ def _required_matches(
 
 
 @jit
-def _pair_gates(detections: LedDetections, dome: DomeIndex, a: int, b: int) -> Floats:
-    """Matching radius of each detection at a pair's attitude, as an angle about the bearing.
-
-        gate_n = GATE_SIGMA s_n sqrt(1 + 1/2 + 2 d_n^2 / D^2)
-
-    The pair's own error adds a shift with half of a detection's variance, and a rotation with 2 s^2 / D^2 times the
-    squared distance d_n from the midpoint; D is the separation.
-
-    Returns
-    -------
-    Floats
-        (N,) rad
-    """
-    x, y = middle(detections.tangent, a, b)
-    direction_variance = 2 / separation(detections.tangent, a, b) ** 2
-    out = np.empty(len(detections.ray))
-    for n in range(len(out)):
-        distance2 = (detections.tangent[n, 0] - x) ** 2 + (detections.tangent[n, 1] - y) ** 2
-        # As seen by the camera, then about the bearing.
-        gate = GATE_SIGMA * detections.sigma[n] * sqrt(1.5 + direction_variance * distance2)
-        out[n] = gate * _bearing_angle_ratio(dome) + dome.scaling_error_rad
-    return out
-
-
-@jit
 def _quick_check(
     detections: LedDetections,
     dome: DomeIndex,
-    R_grid_from_cam: Floats,
+    R_lab_from_cam: Floats,
     focal_ratio: float,
     radius_m: float,
     a: int,
     b: int,
     gates: Floats,
+    rows: NDArray[np.int64],
     required: int,
 ) -> int:
     """Step 5: count the detections with an LED at their predicted direction.
@@ -522,14 +552,14 @@ def _quick_check(
 
     Parameters
     ----------
-    R_grid_from_cam
-        (3, 3) rotation from camera axes to those of the grid of LEDs
+    R_lab_from_cam
+        (3, 3) rotation from camera axes to the lab frame
     radius_m
         Distance of the hypothetical LED from the bearing
     a, b
         Rows of the pair's detections, which count as matched
-    gates
-        (N,) rad, matching radius of each detection
+    gates, rows
+        (N,) rad, matching radius of each detection, and the rows of the detections to count
     required
         The count stops as soon as it reaches this number, or cannot
 
@@ -539,24 +569,24 @@ def _quick_check(
         Number of detections counted, the pair included
     """
     count = 2
-    total = len(detections.ray)
+    leds = dome.pairs.vectors
+    cells = dome.pairs.cells
     radius_offset_m = radius_m - dome.median_radius_m
-    for n in range(total):
+    for done, n in enumerate(rows):
         # Reached or out of reach.
-        if count >= required or count + total - n < required:
+        if count >= required or count + len(rows) - done < required:
             break
         if n in (a, b):
             continue
         # The direction from the bearing, then the LEDs near it.
         if focal_ratio != 1:
-            x, y, z = _direction_from_bearing(
-                _ray(detections, n, focal_ratio), dome, radius_m
-            )
+            x, y, z = direction_from_bearing(_ray(detections, n, focal_ratio), dome, radius_m)
         else:
             u = vectors.row(detections.direction, n)
             slope = vectors.row(detections.direction_per_m, n)
             x = u[0] + radius_offset_m * slope[0]
             y = u[1] + radius_offset_m * slope[1]
             z = u[2] + radius_offset_m * slope[2]
-        count += has_led_near(dome.grid, vectors.rotate(R_grid_from_cam, (x, y, z)), gates[n])
+        x, y, z = vectors.rotate(R_lab_from_cam, (x, y, z))
+        count += nearest(leds, cells.first, cells.row, cells.side, x, y, z, gates[n])[0] >= 0
     return count

@@ -49,7 +49,6 @@ from estimator.trackers.pipeline import (
     Clock,
     FrameTracker,
     Settings,
-    brightest,
     check_algorithms,
     direction_sigma_rad,
     run_all_stages,
@@ -59,6 +58,7 @@ from estimator.trackers.rolling_shutter import Lights, solve_lights
 # Least centroid error of an LED, for effects outside of survey and calibration
 MIN_ERROR_PX = 0.3
 FOCAL_UNCERTAINTY = 0.12  # largest relative error of a focal length that is not calibrated
+PAIR_CHECKS = 4_000_000  # largest number of checks of the search
 FOCAL_CHECKS = 10_000_000  # largest number of checks of its search, which take a second
 MAX_FOCAL_SIGMA = 0.5  # largest focal_sigma of a `Camera`
 # Identifiers after which the focal length is fitted with the attitude.
@@ -67,31 +67,39 @@ SETTINGS = Settings(identifier="led_pairs", solver="rotation_only")
 Identify = Callable[[Floats, Floats, Floats | None], StarMatch | str]
 
 
-def led_pairs(camera: Camera, leds: LedMap, lever: Lever, settings: Settings) -> Identify:
-    """Return the default LED identifier: pair hypotheses and evidence; see `led_search.identify`."""
-    sight = build_dome_index(leds, lever, camera)
+def led_pairs(
+    camera: Camera,
+    leds: LedMap,
+    lever: Lever,
+    settings: Settings,
+    focal_uncertainty: float = 0.0,
+) -> Identify:
+    """Return the default LED identifier: pair hypotheses and evidence; see `led_search.identify`.
+
+    The index holds the pairs of the widest field that a camera of an uncertain focal length may have. It has the field
+    of view of the assumed camera, in whose tangents the detections are.
+    """
+    sight = build_dome_index(leds, lever, camera.zoomed(1 - focal_uncertainty))
+    field_tan, half_size = inner_field(camera.rays(camera.corners_px))
+    sight = sight._replace(field_tan=field_tan, field_area=float(4 * half_size.prod()))
     least_rad = MIN_ERROR_PX / camera.focal_px
     return lambda rays_cam, sigma_rad, flux_s: led_search.identify(
-        rays_cam, np.hypot(sigma_rad, least_rad), sight, flux_s=flux_s
+        rays_cam,
+        np.hypot(sigma_rad, least_rad),
+        sight,
+        FOCAL_CHECKS if focal_uncertainty else PAIR_CHECKS,
+        flux_s,
+        focal_uncertainty,
+        2 * settings.base_stars,
     )
 
 
 def non_dimensional(
     camera: Camera, leds: LedMap, lever: Lever, settings: Settings
 ) -> Identify:
-    """Return the LED identifier for a focal length with the uncertainty FOCAL_UNCERTAINTY, or three sigma if larger.
-
-    See `led_search.identify`. The index holds the pairs of the widest field that the camera may have. It has the field
-    of view of the assumed camera, in whose tangents the detections are.
-    """
+    """Return `led_pairs` for a focal length with the uncertainty FOCAL_UNCERTAINTY, or three sigma if larger."""
     uncertainty = min(max(FOCAL_UNCERTAINTY, 3 * camera.focal_sigma), 0.5)
-    nominal = build_dome_index(leds, lever, camera)
-    sight = build_dome_index(leds, lever, camera.zoomed(1 - uncertainty))
-    sight = sight._replace(field_tan=nominal.field_tan, field_area=nominal.field_area)
-    least_rad = MIN_ERROR_PX / camera.focal_px
-    return lambda rays_cam, sigma_rad, flux_s: led_search.identify(
-        rays_cam, np.hypot(sigma_rad, least_rad), sight, FOCAL_CHECKS, flux_s, uncertainty
-    )
+    return led_pairs(camera, leds, lever, settings, uncertainty)
 
 
 def star_identifier(
@@ -119,6 +127,7 @@ def star_identifier(
     def identify(
         rays_cam: Floats, sigma_rad: Floats, flux_s: Floats | None
     ) -> StarMatch | str:
+        rays_cam = rays_cam[: 2 * settings.base_stars]
         if settings.assumed_deg is None:
             directions = on_sphere(rays_cam, pupil_m, median_radius_m) / median_radius_m
         else:
@@ -259,13 +268,12 @@ class DomeTracker(FrameTracker):
         self, centroids: Centroids, clock: Clock, exposure_s: float | None
     ) -> Attitude:
         """Identify and solve centroids of one time."""
-        bright = brightest(centroids, self.settings)
         if self.settings.identifier in FITS_FOCAL:
-            sigma_rad = direction_sigma_rad(bright, self.camera, self.settings)
+            sigma_rad = direction_sigma_rad(centroids, self.camera, self.settings)
         else:
-            sigma_rad = self._pixel_rad(bright)
-        flux_s = bright.flux / exposure_s if exposure_s else None
-        match = self.identify(self.camera.rays(bright.xy_px), sigma_rad, flux_s)
+            sigma_rad = self._pixel_rad(centroids)
+        flux_s = centroids.flux / exposure_s if exposure_s else None
+        match = self.identify(self.camera.rays(centroids.xy_px), sigma_rad, flux_s)
         return self._solve_identified(centroids, match, clock)
 
     def _solve_identified(

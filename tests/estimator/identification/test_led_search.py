@@ -15,8 +15,8 @@ from estimator.attitude.dome_map import LedMap, Lever, on_sphere, on_surface, pr
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids, StarMatch
-from estimator.identification import led_detections, led_search
-from estimator.identification.led_index import DomeIndex, build_dome_index
+from estimator.identification import led_detections, led_evidence, led_search
+from estimator.identification.led_index import PART, DomeIndex, build_dome_index
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Settings
 from tests.helpers.interpreted import interpreted
@@ -340,27 +340,12 @@ PLAIN = interpreted("estimator.identification.led_search")
 CHANCE = interpreted("estimator.identification.chance")
 
 
-def test_an_led_near_a_direction_is_found_as_by_brute_force() -> None:
-    """Directions over the dome and beyond its rim, gates from a tenth of a grid's cell to three cells."""
-    dome = build_dome_index(spread(150, OVAL, seed=1), LEVER, CAMERA)
-    rng = np.random.default_rng(2)
-    found = 0
-    for _ in range(500):
-        x, y = rng.uniform(-0.8, 0.8, 2)
-        direction = np.array([x, y, np.sqrt(max(1 - x * x - y * y, 0.0))])
-        gate = dome.grid.cell * rng.uniform(0.1, 3)
-        near = np.linalg.norm(dome.grid.direction - direction, axis=1).min() < gate
-        assert PLAIN.has_led_near(dome.grid, tuple(direction), gate) == near
-        found += near
-    assert 100 < found < 400
-
-
 def test_a_ray_intersects_the_sphere_of_an_led_s_radius() -> None:
     """From the pupil along the ray: the point is `radius_m` from the bearing, and its direction is returned."""
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     for ray in CAMERA.rays(np.array([[0.0, 0.0], [1599.0, 300.0], [799.5, 599.5]])):
         for radius_m in (0.9, 1.3):
-            point_m = radius_m * np.array(PLAIN._direction_from_bearing(ray, dome, radius_m))
+            point_m = radius_m * np.array(PLAIN.direction_from_bearing(ray, dome, radius_m))
             assert np.linalg.norm(point_m) == pytest.approx(radius_m, rel=1e-14)
             seen = point_m - dome.pupil_m
             np.testing.assert_allclose(seen / np.linalg.norm(seen), ray, rtol=0, atol=1e-14)
@@ -390,7 +375,7 @@ def test_a_pair_s_gates_are_the_error_of_where_it_puts_a_detection() -> None:
     )
     middle = (noisy[:, [a]] + noisy[:, [b]]) / 2
     errors = middle + turn[:, None] * (seen - (seen[a] + seen[b]) / 2) - noisy
-    gates = PLAIN._pair_gates(detections._replace(sigma=np.full(4, sigma)), dome, a, b)
+    gates = PLAIN.pair_gates(detections._replace(sigma=np.full(4, sigma)), dome, a, b)
     ratio = 1 - np.linalg.norm(LEVER.camera_body_m) / dome.median_radius_m
     for n in (1, 3):
         worst2 = np.linalg.eigvalsh(np.cov(errors[:, n].real, errors[:, n].imag)).max()
@@ -422,11 +407,11 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
     rays = camera.rays(project(Rotation.identity(), position_m, lever, camera))
     detections = led_detections.build_detections(rays, np.full(5, 1e-5), dome)
     gates = np.full(5, 1e-4)
-    R_grid_from_cam = dome.grid.R_grid_from_lab
+    rows = np.arange(5)
     median_m = dome.median_radius_m
     assert (
         PLAIN._quick_check(
-            detections, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required
+            detections, dome, np.eye(3), 1.0, median_m, 0, 1, gates, rows, required
         )
         == found
     )
@@ -438,14 +423,14 @@ def test_the_quick_check_stops_once_the_outcome_is_decided(
     )
     assert (
         PLAIN._quick_check(
-            zoomed, dome, R_grid_from_cam, 1.08, median_m, 0, 1, gates, required
+            zoomed, dome, np.eye(3), 1.08, median_m, 0, 1, gates, rows, required
         )
         == found
     )
     if found > 2:
         assert (
             PLAIN._quick_check(
-                zoomed, dome, R_grid_from_cam, 1.0, median_m, 0, 1, gates, required
+                zoomed, dome, np.eye(3), 1.0, median_m, 0, 1, gates, rows, required
             )
             < found
         )
@@ -457,7 +442,7 @@ def test_a_pair_gives_the_focal_length_at_which_it_matches_two_leds(ratio: float
     rays = CAMERA.rays(np.array([[100.0, 300.0], [1500.0, 900.0]]))
     dome = build_dome_index(spread(60, OVAL, seed=1), LEVER, CAMERA)
     ends = [
-        np.array(PLAIN._direction_from_bearing(*one))
+        np.array(PLAIN.direction_from_bearing(*one))
         for one in ((rays[0], dome, 1.1), (rays[1], dome, 1.3))
     ]
     pixels = CAMERA.pixels(rays)
@@ -606,3 +591,219 @@ def test_random_lights_give_no_attitude_at_any_focal_length() -> None:
         dex.append(best.dex)
     assert np.mean(np.array(dex) > 1) <= 0.1 + 3 * np.sqrt(0.09 / 200)
     assert max(dex) < led_search.ACCEPT_DEX
+
+
+# ---- dense domes
+
+DENSE = 6000
+
+
+def lattice(count: int) -> LedMap:
+    """A Fibonacci lattice in a cap of 27 deg."""
+    row = np.arange(count) + 0.5
+    z = 1 - (1 - np.cos(np.radians(27))) * row / count
+    azimuth = np.pi * (3 - np.sqrt(5)) * row
+    across = np.sqrt(1 - z**2)
+    place_m = 1.2 * np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), z])
+    return LedMap(np.arange(count), place_m, np.zeros(3), np.full(3, 1.2))
+
+
+@pytest.fixture(scope="module")
+def dense() -> tuple[LedMap, DomeIndex]:
+    """LEDs at random places, and the index of their survey."""
+    truth = spread(DENSE, OVAL, 31, 30.0)
+    return truth, build_dome_index(surveyed(truth, 32), LEVER, CAMERA)
+
+
+def test_the_nearest_leds_of_a_dense_dome_match_brute_force(
+    dense: tuple[LedMap, DomeIndex],
+) -> None:
+    _, dome = dense
+    direction = dome.position_m / dome.radius_m[:, None]
+    lever_m = np.linalg.norm(LEVER.camera_body_m)
+    scale = (1 - lever_m / dome.median_radius_m) / (1 - lever_m / dome.radius_m)
+    for led in range(0, DENSE, 97):
+        chord = np.linalg.norm(direction - direction[led], axis=1)
+        nearest = np.argsort(chord)[:PART]
+        assert dome.near[led].tolist() == nearest.tolist()
+        np.testing.assert_allclose(
+            dome.near_chord[led], chord[nearest] * (scale[led] + scale[nearest]) / 2, 1e-9, 0
+        )
+
+
+def test_the_index_of_a_dense_dome_grows_with_its_leds() -> None:
+    """Pairs of one LED, of three times as many LEDs: all pairs would be three times as many."""
+    pairs = []
+    for count in (5000, 15_000):
+        dome = build_dome_index(lattice(count), LEVER, CAMERA)
+        pairs.append(len(dome.pairs.pair) / len(dome.radius_m))
+    assert pairs[1] == pytest.approx(pairs[0], rel=0.05)
+
+
+@pytest.mark.parametrize("surface", [OVAL, FLAT], ids=["ellipsoid", "flat"])
+def test_all_leds_that_the_camera_can_see_are_in_the_field(surface: tuple) -> None:
+    """Against the projection of every LED of a sparse dome, which has the same field."""
+    leds = spread(1500, surface, 3)
+    dome = build_dome_index(leds, LEVER, CAMERA)
+    rng = np.random.default_rng(4)
+    for _ in range(100):
+        body_from_lab = pose(rng)
+        xy = project(body_from_lab, leds.position_m, LEVER, CAMERA)
+        seen = np.flatnonzero(CAMERA.contains(np.nan_to_num(xy, nan=-1e9)))
+        R_cam_from_lab = (LEVER.cam_from_body * body_from_lab).as_matrix()
+        field = led_evidence._field(dome, R_cam_from_lab)
+        assert len(set(field)) == len(field)
+        assert np.isin(seen, field).all()
+
+
+def test_lights_from_left_to_right_match_as_those_in_any_order(
+    dense: tuple[LedMap, DomeIndex],
+) -> None:
+    """A search by halves under a dense dome finds the nearest light that a search of all lights finds."""
+    truth, dome = dense
+    sparse = dome._replace(near=dome.near[:0])
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        body_from_lab = pose(rng, 18)
+        pixels, _ = lights(truth, body_from_lab, rng, 0.2, 40)
+        rays = CAMERA.rays(pixels[np.argsort(pixels[:, 0])])
+        rays = rays[np.argsort(rays[:, 0] / rays[:, 2])]
+        detections = led_detections.build_detections(rays, np.full(len(rays), 2e-5), dome)
+        R_cam_from_lab = (LEVER.cam_from_body * body_from_lab).as_matrix()
+        leds = led_evidence._field(dome, R_cam_from_lab)
+        found = [
+            led_evidence._match(
+                detections, index, R_cam_from_lab, 1.0, leds, (0.01, -0.02), 1.5, 20.0
+            )
+            for index in (dome, sparse)
+        ]
+        assert len(found[0][0]) > 40
+        np.testing.assert_array_equal(found[0][0], found[1][0])
+        np.testing.assert_array_equal(found[0][1], found[1][1])
+        assert found[0][2] == found[1][2]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("dead", "false", "least"), [(0.0, 0, 0.97), (0.05, 4, 0.9), (0.2, 10, 0.5)]
+)
+def test_a_dense_dome_is_identified_and_never_wrongly(
+    dense: tuple[LedMap, DomeIndex], dead: float, false: int, least: float
+) -> None:
+    truth, dome = dense
+    rng = np.random.default_rng(34)
+    found = 0
+    for _ in range(40):
+        pixels, names = lights(truth, pose(rng, 20), rng, dead, false)
+        match = identified(pixels, dome)
+        if not isinstance(match, str):
+            found += 1
+            assert names_right(match, names)
+    assert found >= least * 40
+
+
+def test_like_thirds_of_a_dense_dome_are_called_ambiguous(
+    dense: tuple[LedMap, DomeIndex],
+) -> None:
+    """A third of the dome, turned twice by 120 deg: three attitudes explain every field."""
+    truth, _ = dense
+    azimuth = np.arctan2(truth.position_m[:, 1], truth.position_m[:, 0])
+    third = truth.position_m[(azimuth > 0) & (azimuth < 2 * np.pi / 3)]
+    place_m = np.concatenate(
+        [Rotation.from_euler("z", 120 * k, degrees=True).apply(third) for k in range(3)]
+    )
+    leds = LedMap(np.arange(len(place_m)), place_m, *OVAL)
+    dome = build_dome_index(leds, LEVER, CAMERA)
+    assert len(dome.near) == len(place_m)
+    rng = np.random.default_rng(38)
+    for _ in range(15):
+        pixels, _ = lights(leds, pose(rng, 18), rng)
+        assert identified(pixels, dome) == led_search.AMBIGUOUS
+
+
+@pytest.mark.slow
+def test_a_dense_lattice_gives_no_wrong_attitude() -> None:
+    """A Fibonacci lattice turned by the golden angle is the same, but for one LED's share of the dome.
+
+    A turn moves an LED at the angle t from the axis by c / (N sin t), c = 1 - cos of the dome's half-angle: 0.04 mrad,
+    of which most turns the field. The map's errors are 0.3 mrad, so that no attitude may be given at most poses.
+    """
+    truth = lattice(DENSE)
+    dome = build_dome_index(surveyed(truth, 35), LEVER, CAMERA)
+    rng = np.random.default_rng(36)
+    statuses = []
+    for _ in range(60):
+        pixels, names = lights(truth, pose(rng, 18), rng)
+        match = identified(pixels, dome)
+        statuses.append(match)
+        assert isinstance(match, str) or names_right(match, names)
+    assert statuses.count(led_search.AMBIGUOUS) >= 40
+
+
+def test_places_that_are_alike_differ_in_evidence_by_the_map_s_errors() -> None:
+    """Residuals of the same lights with the LEDs of two like places, of 20,000 frames of 30 lights."""
+    dome = build_dome_index(
+        replace(spread(150, OVAL, seed=1), sigma_m=ERROR_M), LEVER, CAMERA
+    )
+    sigma_rad = 1.5 * dome.led_sigma
+    rays = CAMERA.rays(np.random.default_rng(6).uniform(0, 1200, (30, 2)))
+    detections = led_detections.build_detections(rays, np.full(30, sigma_rad), dome)
+    rng = np.random.default_rng(7)
+    noise = sigma_rad * rng.standard_normal((20_000, 60))
+    errors = dome.led_sigma * rng.standard_normal((2, 20_000, 60))
+    chi2 = ((noise - errors) ** 2).sum(axis=2) / (sigma_rad**2 + dome.led_sigma**2)
+    difference_dex = (chi2[0] - chi2[1]) / (2 * np.log(10))
+    # 4 deviations of a standard deviation.
+    assert detections.blur_dex * np.sqrt(30) == pytest.approx(difference_dex.std(), rel=0.02)
+
+
+def test_a_like_place_within_the_map_s_errors_is_a_rival() -> None:
+    """Two hypotheses of 20 lights, all of other LEDs: beyond chance their difference must exceed its own noise."""
+    star = np.arange(20)
+    best = led_evidence.LedHypothesis(star, star, np.eye(3), 60.0)
+    detections = SimpleNamespace(ray=np.zeros((20, 3)), blur_dex=2.0)
+    for rival_dex, counted_dex in ((40.0, 40 + 3.5 * 2 * np.sqrt(20)), (4.0, 4.0)):
+        rival = led_evidence.LedHypothesis(star, star + 100, np.eye(3), rival_dex)
+        for pair in ((rival, best), (best, rival)):
+            kept, counted = PLAIN._better(*pair, -np.inf, detections)
+            assert kept.dex == 60.0
+            assert counted == pytest.approx(counted_dex, rel=1e-12)
+    agreeing = led_evidence.LedHypothesis(star, star, np.eye(3), 50.0)
+    assert PLAIN._better(agreeing, best, -np.inf, detections)[1] == -np.inf
+
+
+@pytest.mark.slow
+def test_random_lights_give_no_attitude_under_a_dense_dome(
+    dense: tuple[LedMap, DomeIndex],
+) -> None:
+    rng = np.random.default_rng(37)
+    for _ in range(40):
+        pixels = rng.uniform(0, [1599, 1199], (75, 2))
+        assert isinstance(identified(pixels, dense[1]), str)
+
+
+@pytest.mark.parametrize("agreeing", [1, 2])
+def test_another_part_of_the_field_must_find_the_same(
+    dense: tuple[LedMap, DomeIndex], agreeing: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An attitude that one part alone finds is its own rival; a second part that agrees ends the search."""
+    _, dome = dense
+    rays = CAMERA.rays(np.random.default_rng(39).uniform(0, [1599, 1199], (75, 2)))
+    detections = led_detections.build_detections(rays, np.full(75, 2e-5), dome)
+    star = np.arange(40)
+    found = led_evidence.LedHypothesis(star, star, np.eye(3), 90.0)
+    tested = []
+
+    def answer(*arguments):
+        tested.append(arguments[2])
+        return (found if len(tested) in (3, 5, 6)[:agreeing] else PLAIN._nothing()), -np.inf
+
+    monkeypatch.setattr(PLAIN, "_test_pair", answer)
+    best, rival_dex = PLAIN._search_parts(detections, dome, 10**6)
+    assert best.dex == 90.0
+    assert rival_dex == (90.0 if agreeing == 1 else -np.inf)
+    assert (len(tested) == 5) == (agreeing == 2)
+    apart = np.linalg.norm(
+        detections.tangent[tested[3:]] - detections.tangent[tested[2]], axis=1
+    )
+    assert (apart > 0.2 * np.sqrt(dome.field_area)).all()

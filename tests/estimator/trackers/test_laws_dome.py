@@ -401,13 +401,13 @@ def test_a_warm_up_changes_no_answer_under_a_dome(
     assert eye.solve(frame).attitude.status == before
 
 
-@law(led_index.build_dome_index, led_index.build_grid, led_index.scale_pair_angles)
+@law(led_index.build_dome_index, led_index.near_leds, led_index.scale_pair_angles)
 @given(rng=SEEDS, count=some.integers(20, 60))
 def test_a_dome_index_covers_the_whole_dome(rng: np.random.Generator, count: int) -> None:
     leds = even(count)
     dome = led_index.build_dome_index(leds, lever(rng), CAMERA)
-    grid = led_index.build_grid(leds.position_m / 1.2)
-    assert grid.first[-1] == len(grid.direction) == count
+    near, chord = led_index.near_leds(leds.position_m / 1.2, 0.5)
+    assert near.shape == chord.shape == (0, led_index.PART)
     np.testing.assert_allclose(np.sort(dome.radius_m), 1.2, rtol=1e-12, atol=0)
     assert (np.diff(dome.pairs.angle_rad) >= 0).all()
     known = pair_index.build(units(rng, count), 1.0)
