@@ -153,12 +153,12 @@ def test_files(modules: list[Path], nearest: bool) -> list[str]:
 
 
 def draw(modules: list[Path], count: int, seed: int) -> list[dict[str, Any]]:
-    """So many mutants, in random order."""
+    """So many mutants, in random order, without the few that are no Python, such as 2**not 2."""
     every = [(path, at, how) for path in modules for at, how in places(path).items()]
     random = Random(seed)
     chosen = random.sample(every, min(count, len(every)))
     print(f"{len(every)} places in {len(modules)} modules; seed {seed}", flush=True)
-    return [
+    drawn = [
         {
             "file": str(path.relative_to(TREE)),
             "line": at[0],
@@ -167,6 +167,22 @@ def draw(modules: list[Path], count: int, seed: int) -> list[dict[str, Any]]:
         }
         for path, at, how in chosen
     ]
+    return [one for one in drawn if is_python(mutated((TREE / one["file"]).read_text(), one))]
+
+
+def mutated(source: str, mutant: dict[str, Any]) -> str:
+    """The text of a module with its change."""
+    name, occurrence = mutant["how"]
+    return str(mutate_code(source, cosmic_ray.plugins.get_operator(name)(), occurrence))
+
+
+def is_python(source: str) -> bool:
+    """Whether a text can be compiled."""
+    try:
+        ast.parse(source)
+    except SyntaxError:
+        return False
+    return True
 
 
 @cache
@@ -388,21 +404,16 @@ def try_mutant(mutant: dict[str, Any], tests: Tests) -> dict[str, Any]:
     began_s = time.monotonic()
     source = path.read_text()
     stamp_ns = path.stat().st_mtime_ns
-    name, occurrence = mutant["how"]
-    mutated = (
-        source
-        if CONTROL
-        else mutate_code(source, cosmic_ray.plugins.get_operator(name)(), occurrence)
-    )
-    lines = zip(source.splitlines(), mutated.splitlines(), strict=False)
+    changed = source if CONTROL else mutated(source, mutant)
+    lines = zip(source.splitlines(), changed.splitlines(), strict=False)
     old, new = next((pair for pair in lines if len(set(pair)) > 1), ("", ""))
     function = function_at(source, (mutant["line"], mutant["column"]))
     outcome = "import anew"
     scratch_cache(mutant["file"])
     try:
-        path.write_text(mutated)
+        path.write_text(changed)
         if function and code_of(source, path, function)[0] not in tests.imported:
-            key, code = code_of(mutated, path, function)
+            key, code = code_of(changed, path, function)
             names = tests.chosen(mutant["file"], [key])
             outcome = tests.ask("try_code", key, marshal.dumps(code), names, SCRATCH)
         if outcome == "import anew":
