@@ -201,7 +201,7 @@ class RunPanel:
             state.scene, state.overrides if stays_closed else others, feedback
         )
         self.loop.disable()  # no second change while this one runs
-        await self.page.open(state.scene, others | control)
+        await self.page.open(state.scene, others | control, head=state.head)
         if self.page.is_open:
             # The old value, if the scene refused the change.
             self.loop.set_value(self.feedback)

@@ -215,7 +215,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
     grid-template-areas: "head" "sensor" "side" "keys" }}
   .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab .lab-split {{ display: none }}
   .lab-scene {{ flex: 1 1 150px }}
-  .lab-said {{ text-align: left; flex-basis: 120px }}
+  .lab-said {{ text-align: left; flex-basis: 120px }} .lab-said:empty {{ flex-basis: 0 }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto calc(min(70vh, 75vw) + 200px) }}
   .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}

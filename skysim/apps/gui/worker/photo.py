@@ -132,7 +132,8 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     setup = trials.prepared_setup(plan.spec, segment.settings)
     lab = setup.lab
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    bench = Workbench(lab.scene, lab, setup.estimator, lab.start, lenses.scene_lens(lab), {})
+    lens = lenses.scene_lens(lab)
+    bench = Workbench(lab.scene, lab, setup.estimator, lab.start, lens, {}, lab)
     bench.magnitude = workbench.magnitude_by_id(lab)
     photo = scene_photo(bench, bench.frame_view(frame, truth, report, 0.0))
     if row.error:

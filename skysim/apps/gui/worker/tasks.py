@@ -31,6 +31,7 @@ from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.simulation import checks
 from skysim.simulation.checks.plan_check import Check
+from skysim.simulation.lab import MAIN
 
 KEPT_IMAGES = 3  # number of newest images that are kept: the page may show an earlier one
 
@@ -135,6 +136,7 @@ class Worker:
         overrides: OverrideTexts,
         solve: bool,
         angles_deg: Triple | None = None,
+        head: str = MAIN,
     ) -> tuple[SceneInfo, FrameView]:
         """Set up a scene and render a first frame.
 
@@ -142,8 +144,10 @@ class Worker:
         ----------
         angles_deg
             Attitude, if it is neither the kept one nor the start
+        head
+            Name of the camera; the main one if there is no such head
         """
-        bench = Workbench.open(scene, overrides, self.current)
+        bench = Workbench.open(scene, overrides, self.current, head)
         if angles_deg is not None:
             bench.lab_from_body = geometry.from_angles(bench.lab, angles_deg)
         self.current = bench
@@ -154,9 +158,13 @@ class Worker:
         surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
         return bench.scene_info._replace(surveyed=surveyed), self.render(solve)
 
-    def render(self, solve: bool) -> FrameView:
-        view = self.workbench.render_at_rest(solve)
+    def render(self, solve: bool, index: int = 0) -> FrameView:
+        view = self.workbench.render_at_rest(solve, index)
         return self.show_frame(view, self.levels)
+
+    def render_next(self, index: int, solve: bool) -> FrameView:
+        """Render a later frame of the run at rest that `render` has begun."""
+        return self.render(solve, index)
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
@@ -189,7 +197,7 @@ class Worker:
 
     def check(self) -> Check:
         """The facts of the scene and its warnings, as `skysim check` prints them."""
-        return checks.check(self.workbench.lab)
+        return checks.check(self.workbench.whole)
 
     def ambiguity(self) -> AmbiguityMap:
         return ambiguity(self.workbench.lab)
