@@ -236,12 +236,12 @@ class Arrangement:
 
     Attributes
     ----------
-    charts
-        Charts that are drawn again when the theme changes
+    chart
+        Chart that is drawn again when the theme changes
     """
 
-    def __init__(self, charts: list[ui.echart]) -> None:
-        self.charts = charts
+    def __init__(self, chart: ui.echart) -> None:
+        self.chart = chart
         self.dark = ui.dark_mode(True)
         ui.add_body_html(f"<script>{SPLITTER_JS}</script>")
 
@@ -278,7 +278,6 @@ class Arrangement:
         )
 
     def set_dark(self, dark: bool) -> None:
-        """Change the theme and draw the charts again, which take their colors from it."""
+        """Change the theme and draw the chart again, which takes its colors from it."""
         self.dark.set_value(dark)
-        for chart in self.charts:
-            chart.update()
+        self.chart.update()

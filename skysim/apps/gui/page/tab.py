@@ -141,9 +141,7 @@ class Tab(context.PageContext):
         await asyncio.sleep(PAUSE_S)
         self.history = History(self, self.show_query, self.is_settling)
         self.end_step = self.history.end_step
-        self.arrangement = head.Arrangement(
-            [self.run_panel.strips.chart, self.study_panel.chart]
-        )
+        self.arrangement = head.Arrangement(self.study_panel.chart)
         self.actions = Actions(self, self.run_panel.step, self.performers(), self.commands())
         # A timer waits for the browser, and NiceGUI then sends the unfinished page. So timers come after all pauses.
         ui.timer(readouts.UPDATE_S, self.update_lights)

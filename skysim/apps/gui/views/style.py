@@ -124,6 +124,11 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-panels .q-tab-panel > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
+.lab-strips {{ position: relative; width: 100% }}
+.lab-compared {{ width: 100%; padding: 4px 0 8px; border-top: 1px solid {COLORS["line"]} }}
+.lab-compared > .mono {{ white-space: pre-wrap; overflow-wrap: anywhere; padding-left: 20px; text-indent: -20px }}
+.lab-compared > [data-run=own]::before {{ content: "● "; color: {CURVE_COLORS[0]} }}
+.lab-compared > [data-run=reference]::before {{ content: "◇ " }}
 .lab-timeline {{ width: 100% }} .lab-timeline .lane {{ position: relative; height: 26px;
   border-bottom: 1px solid {COLORS["line"]} }}
 .lab-timeline span {{ position: absolute; left: 0; font-size: 11px; line-height: 14px; pointer-events: none }}

@@ -48,6 +48,8 @@ class Worker:
         Newest images for the page by number, each with its saturation value
     number
         Number of the last image
+    flight, reference
+        The scene's flight, and the one that is kept for comparison
     pushed
         Motion of the pushed vehicle, as long as the workbench has its attitude
     surveyed
@@ -65,6 +67,7 @@ class Worker:
     shown: dict[int, tuple[pixels.PixelLevels, float]] = field(default_factory=dict)
     number: int = 0
     flight: playback.Playback | None = None
+    reference: playback.Playback | None = None
     pushed: geometry.Push | None = None
     surveyed: playback.Survey | None = None
     other: photo.PhotoPixels | None = None
@@ -236,6 +239,19 @@ class Worker:
         if self.flight is None or not 0 <= index < len(self.flight.frames):
             raise InputError("", f"the flight has no frame {index}")
         return self.show_frame(*self.flight.show(index))
+
+    def keep_flight(self) -> None:
+        """Keep the flight as the reference of further ones."""
+        self.reference = self.flight
+
+    def kept_frame(self, index: int) -> photo.Photo:
+        """A frame of the reference. Raises InputError if there is none."""
+        kept = self.reference
+        if kept is None:
+            raise InputError("", "the reference's frames were lost with their worker")
+        picture = photo.scene_photo(kept.bench, kept.frames[index].view)
+        frame, _ = kept.flight.render(index, kept.bench.head)
+        return self.show_photo((picture, frame.image_dn))
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
         """Repeat a study's trial; the page shows its frame."""
