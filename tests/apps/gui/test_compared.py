@@ -125,7 +125,7 @@ def test_the_reference_s_frames_survive_another_scene_and_another_flight() -> No
     kept = flown(worker)
     worker.flight_frame(1)
     frame = worker.export()["frame.png"]
-    worker.keep_flight()
+    worker.keep_flight(True)
     # Another tracker on the same laboratory, then another scene.
     for scene, overrides in (
         ("afit_simsat_ideal", few | {"tracker.solver": "pnp"}),
@@ -139,6 +139,9 @@ def test_the_reference_s_frames_survive_another_scene_and_another_flight() -> No
         assert numbers(own[1].row) != numbers(kept[1].row)
         assert worker.export()["frame.png"] == frame
         assert worker.workbench.lab_from_body is before
+    worker.keep_flight(False)
+    with pytest.raises(InputError, match="lost with their worker"):
+        worker.kept_frame(1)
 
 
 # In the browser.

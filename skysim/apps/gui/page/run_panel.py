@@ -333,14 +333,15 @@ class RunPanel:
         shown = told(self.page.state, self.rows)
         drawn = strips(self.rows, self.log)
         kept = KeptRun(shown, info.scene, self.rows, drawn, self.end_s)
-        await self.page.ask("keep_flight")
+        await self.page.ask("keep_flight", True)
         self.reference = kept
         self.draw()
 
-    def forget(self) -> None:
+    async def forget(self) -> None:
         """Compare no more."""
         self.reference = None
         self.draw()
+        await self.page.ask("keep_flight", False)
 
     def compare(self) -> None:
         """Show how this flight differs from the reference."""

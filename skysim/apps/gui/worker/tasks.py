@@ -106,7 +106,7 @@ class Worker:
     @property
     def survey_of_scene(self) -> playback.Survey:
         """The survey of the current scene. Raises InputError if none was planned."""
-        if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
+        if self.surveyed is None or not self.surveyed.is_of(self.workbench.whole.scene):
             raise InputError("", "no survey of this scene: plan one")
         return self.surveyed
 
@@ -158,7 +158,7 @@ class Worker:
         self.overrides = dict(overrides)
         self.flight = None
         self.pushed = None
-        surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
+        surveyed = self.surveyed is not None and self.surveyed.is_of(bench.whole.scene)
         return bench.scene_info._replace(surveyed=surveyed), self.render(solve)
 
     def render(self, solve: bool, index: int = 0) -> FrameView:
@@ -207,7 +207,7 @@ class Worker:
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
-        self.surveyed, plan = playback.begin(self.workbench.scene, frames)
+        self.surveyed, plan = playback.begin(self.workbench.whole.scene, frames)
         return plan
 
     def adjust_survey(self, frames: int) -> SurveyFound:
@@ -240,9 +240,9 @@ class Worker:
             raise InputError("", f"the flight has no frame {index}")
         return self.show_frame(*self.flight.show(index))
 
-    def keep_flight(self) -> None:
-        """Keep the flight as the reference of further ones."""
-        self.reference = self.flight
+    def keep_flight(self, keeps: bool) -> None:
+        """Keep the flight as the reference of further ones, or keep none."""
+        self.reference = self.flight if keeps else None
 
     def kept_frame(self, index: int) -> photo.Photo:
         """A frame of the reference. Raises InputError if there is none."""
