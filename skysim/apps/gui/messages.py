@@ -204,6 +204,10 @@ class SceneInfo(NamedTuple):
         Whether the camera has noise; without it a frame is the expected value
     geometry
         See `worker.geometry.lab_geometry`
+    heads, head
+        Names of the cameras, and that of the shown one
+    code_frames
+        Number of frames in which LEDs are named by their codes at the latest; 0 if they blink none
     surveyed
         Whether a survey of the dome has begun
     """
@@ -218,6 +222,9 @@ class SceneInfo(NamedTuple):
     noise: bool
     geometry: Record
     lens: Lens
+    heads: tuple[str, ...]
+    head: str
+    code_frames: int
     surveyed: bool = False
 
 

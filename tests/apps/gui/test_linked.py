@@ -104,10 +104,6 @@ def test_the_strip_of_residuals_has_a_dot_for_each_identified_light_and_frame() 
     residuals = [Residual(*one, (0.0, 0.0, 0.0)) for one in values]
     (strip,) = strips.strips([], {}, residuals)
     assert strip.dots == [[0.25, 0.0312, 7], [0.5, 0.0625, 7], [0.5, 0.131, 9]]
-    assert strips.y_axis(strip, 0)["max"] == 0.2
-    fields = strips.dot_fields([strips.Strip("first"), strip], "LED {}".format)
-    assert fields["names"] == {7: "LED 7", 9: "LED 9"}
-    assert (fields["grid"], fields["place"]["top"]) == (1, strips.STRIP_PX + strips.HEAD_PX)
     # A chart that is drawn again does not send them again.
     assert not any(curve.points for curve in strip.curves)
 
@@ -217,8 +213,15 @@ def test_hovering_a_light_highlights_it_in_all_views(dome: Any, tmp_path: Path) 
     pictured(dome, "the_table_of_lights")
 
 
-DOT = """() => { const canvas = document.querySelector(".lab-dots"), dots = getElement(+canvas.id.slice(1));
-  const at = dots.scale(), box = canvas.getBoundingClientRect(), dot = dots.shown.dots.at(-3), [x, y] = at(dot);
+DOT = """() => {
+  const canvas = document.querySelector(".lab-dots"), strips = getElement(+canvas.parentElement.id.slice(1));
+  const at = strips.scale(), box = canvas.getBoundingClientRect(), dot = strips.dots.at(-3), [x, y] = at(dot);
+  const axis = strips.chart.getOption().yAxis[strips.grid], most = Math.max(...strips.dots.map((one) => one[1]));
+  // The axis ends at the next greater of 1, 2, 5, 10 times a power of ten, and every dot's light has its name.
+  const decade = 10 ** Math.floor(Math.log10(axis.max / 1.5));
+  const isRound = Math.abs([2, 5, 10].reduce((rest, step) => rest * (axis.max / decade - step), 1)) < 1e-6;
+  if (!isRound || axis.max < most || axis.max > 2.5 * most) throw Error(`axis to ${axis.max} of dots up to ${most}`);
+  if (strips.dots.some(([, , id]) => !/^[A-Z]/.test(strips.names[id]))) throw Error("a dot without a name");
   return [dot[2], box.left + x, box.top + y]; }"""  # number and place of a dot on the screen
 
 

@@ -50,7 +50,7 @@ ANGLES = ((5.0, -3.0, 20.0), (-4.0, 2.0, 140.0))
 @pytest.mark.slow
 def test_a_check_equals_that_of_the_command() -> None:
     lab = build_lab(loader.load("afit_simsat", {"exposure.time": "50 ms"}))
-    found = Worker(SimpleNamespace(lab=lab)).check()
+    found = Worker(SimpleNamespace(whole=lab)).check()
     expected = checks.check(lab)
     assert [fact.name for fact in found.facts] == [fact.name for fact in expected.facts]
     assert found.findings == expected.findings

@@ -137,7 +137,9 @@ def test_colors_are_distinguishable_with_color_blindness(eye: str) -> None:
     # These are dashed.
     marks = [color for kind, color in overlay.COLORS.items() if kind != "windows"]
     states = [[theme[name] for name in STATES] for theme in (style.DARK, style.LIGHT)]
-    for colors in (style.CURVE_COLORS, marks, *states):
+    # The curves of the reference have the color of the text.
+    curves = [[*style.CURVE_COLORS, theme["text"]] for theme in (style.DARK, style.LIGHT)]
+    for colors in (*curves, marks, *states):
         assert distance(colors, eye) > 0.1
 
 

@@ -43,6 +43,7 @@ VIEWS = (
     PageView("shefex2", kind="flight", t_s=12.3456, angles_deg=(0.0, 0.0, 0.0)),
     PageView("shefex2", kind="replay", study="monte_carlo_ab_1", trial=17),
     PageView("shefex2", kind="photo", photo="my sky?.jpg"),
+    PageView("shefex2", angles_deg=(1.0, 2.0, 3.0), head="side & rear"),
 )
 
 

@@ -33,6 +33,8 @@ class Head:
                 on_change=self.scene_picked,
             )
             self.picker.props('aria-label="Scene"').classes("lab-scene").mark("scene")
+            self.camera = widgets.select([], "borderless", on_change=self.camera_picked)
+            self.camera.props('aria-label="Camera"').mark("camera")
             self.banner = (
                 widgets.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
             )
@@ -80,11 +82,19 @@ class Head:
         if self.picker.value != self.page.state.scene:
             await self.page.open(str(self.picker.value))
 
+    async def camera_picked(self) -> None:
+        """Show another camera of the scene at the same attitude of the vehicle."""
+        state = self.page.state
+        if self.camera.value not in (None, state.head):
+            await self.page.open(*state.opened, head=str(self.camera.value))
+
     # Contents.
 
     def set_scene(self, info: SceneInfo) -> None:
         """Show the name and the noise of a newly opened scene."""
         self.picker.set_value(self.page.state.scene)
+        self.camera.set_options(list(info.heads), value=info.head)
+        self.camera.set_visibility(len(info.heads) > 1)
         self.noise.set_value(info.noise)
 
     def set_state(self, state: PageView) -> None:
@@ -226,12 +236,12 @@ class Arrangement:
 
     Attributes
     ----------
-    charts
-        Charts that are drawn again when the theme changes
+    chart
+        Chart that is drawn again when the theme changes
     """
 
-    def __init__(self, charts: list[ui.echart]) -> None:
-        self.charts = charts
+    def __init__(self, chart: ui.echart) -> None:
+        self.chart = chart
         self.dark = ui.dark_mode(True)
         ui.add_body_html(f"<script>{SPLITTER_JS}</script>")
 
@@ -268,7 +278,6 @@ class Arrangement:
         )
 
     def set_dark(self, dark: bool) -> None:
-        """Change the theme and draw the charts again, which take their colors from it."""
+        """Change the theme and draw the chart again, which takes its colors from it."""
         self.dark.set_value(dark)
-        for chart in self.charts:
-            chart.update()
+        self.chart.update()

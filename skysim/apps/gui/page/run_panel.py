@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from nicegui import ui
 
@@ -21,13 +21,17 @@ from skysim.apps.gui.messages import (
     SceneInfo,
 )
 from skysim.apps.gui.page.residuals import FlightLights, by_light
-from skysim.apps.gui.page.strips import StripChart, rms_line, strips
+from skysim.apps.gui.page.strips import Strip, Strips, rms_line, same_times, strips
 from skysim.apps.gui.views import context, forms, widgets
-from skysim.results import scoring
+from skysim.apps.gui.views.context import PageView
+from skysim.apps.gui.worker import photo
+from skysim.core.types import Record
+from skysim.results import run_report, scoring
 from skysim.scene.scene import Scene
 
 SPEEDS = {"real time": 1.0, "½": 0.5, "¼": 0.25, "1/10": 0.1, "2×": 2.0, "5×": 5.0}
 TIME_S = attrgetter("row.t_s")  # time of a flight's row
+REFERENCE = "reference"  # of its frames, in the page's banner
 CONTROL = "motion.control"
 CONTROL_KEYS = (CONTROL, "motion.maneuver")
 BUDGET_S = 0.04  # time to compute a piece of the flight; a key waits for at most one
@@ -42,6 +46,20 @@ class Timeline(ui.element, component="js/timeline.js"):  # type: ignore[call-arg
     """What happened in a flight, implemented in timeline.js; a click shows the frame."""
 
 
+class Comparison(ui.element, component="js/compared.js"):  # type: ignore[call-arg]
+    """How this flight differs from the reference, implemented in compared.js."""
+
+
+class KeptRun(NamedTuple):
+    """A flight to which others are compared: its description (`told`), scene, rows, strips, and their end."""
+
+    shown: Record
+    scene: Scene
+    rows: Sequence[FlightRow]
+    strips: Sequence[Strip]
+    end_s: float
+
+
 class RunPanel:
     """Panel that computes the flight, plays, pauses, steps and seeks.
 
@@ -53,6 +71,8 @@ class RunPanel:
         Rows of the computed frames, and curves of the motion
     residuals
         Residuals of the identified lights, as in `FlightStep`
+    reference
+        The flight that is kept for comparison, if any; another scene does not empty it
     computing, stopping
         Whether the flight is being computed, and whether the computation has been told to stop
     playing, showing
@@ -75,6 +95,7 @@ class RunPanel:
 
     feedback = ""
     computing = stopping = playing = showing = False
+    reference: KeptRun | None = None
     wanted_s: float | None = None
     sought: int | None = None
     plays_when_done = False
@@ -88,7 +109,6 @@ class RunPanel:
         self.factor = SPEEDS["real time"]
         self.slot = ui.context.slot
         self.build()
-        ui.on("moment", self.clicked)
 
     def build(self) -> None:
         with widgets.row(1):
@@ -121,9 +141,12 @@ class RunPanel:
             )
         with widgets.row(3):
             self.summary = ui.label().classes("quiet flex-grow").mark("flight")
+            self.keep_button = widgets.button("Keep as reference", self.keep, "keep", "flat")
+            self.keep_button.props("no-wrap")
             self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
+        self.comparison = Comparison().on("switch", self.switch).on("forget", self.forget)
         self.timeline = Timeline().on("moment", self.clicked).mark("timeline")
-        self.strips = StripChart(self.page.contents)
+        self.strips = Strips().on("moment", self.clicked).mark("strips")
         self.lights = FlightLights().mark("residuals")
         self.clear()
         self.page.derive(lambda view: view.opened, self.clear)
@@ -142,7 +165,7 @@ class RunPanel:
 
     def enable(self) -> None:
         """Enable the controls if there are frames; without frames, show what to do."""
-        for item in (self.back, self.play, self.forward, self.csv_button):
+        for item in (self.back, self.play, self.forward, self.keep_button, self.csv_button):
             item.set_enabled(self.is_ready)
         self.seek.props(f"max={max(len(self.rows) - 1, 1)}")
         self.seek.props["disabled"] = not self.is_ready
@@ -174,15 +197,16 @@ class RunPanel:
         self.from_s = 0.0
         self.seek.set_value(0)
         self.bar.set_value(0)
-        self.strips.draw([], 1.0, str)
+        self.strips.run_method("show", [], [], 1.0, {})
         self.lights.run_method("show", [])
         self.timeline.run_method("show", [], [], 1.0)
+        self.compare()
         self.enable()
 
     def hide_moment(self) -> None:
         """Show no moment of the flight, as the page does not."""
         self.clock.set_text("")
-        self.strips.set_moment(math.nan)
+        self.page.contents.set(self.strips.id, {"moment": "nan"})
 
     async def close_loop(self) -> None:
         """Reopen the scene with another feedback. An opened loop is closed again with the controller of the file."""
@@ -201,7 +225,7 @@ class RunPanel:
             state.scene, state.overrides if stays_closed else others, feedback
         )
         self.loop.disable()  # no second change while this one runs
-        await self.page.open(state.scene, others | control)
+        await self.page.open(state.scene, others | control, head=state.head)
         if self.page.is_open:
             # The old value, if the scene refused the change.
             self.loop.set_value(self.feedback)
@@ -269,22 +293,78 @@ class RunPanel:
     def draw(self) -> None:
         """Draw the strips with the frames so far."""
         self.drawn_s = time.monotonic()
-        ends = [*self.log.get("t_s", ())[-1:], *map(TIME_S, self.rows[-1:])]
         lights = (
             () if self.computing else self.residuals
         )  # residuals are many, so they are sent once
-        self.strips.draw(
-            strips(self.rows, self.log, lights), max(ends, default=1.0), self.page.sensor.name
-        )
+        kept = self.other_run
+        drawn = strips(self.rows, self.log, lights, kept.rows if kept else ())
+        end_s = max(self.end_s, kept.end_s) if kept else self.end_s
+        names = {one.id: self.page.sensor.name(one.id) for one in lights}
+        self.strips.run_method("show", drawn, kept.strips if kept else [], end_s, names)
         frames = [
             (one.row.t_s, one.row.status, one.row.wrong, one.saturated) for one in self.rows
         ]
-        self.timeline.run_method("show", frames, self.limits, max(ends, default=1.0))
+        self.timeline.run_method("show", frames, self.limits, end_s)
         info = self.page.scene_info
         assert info is not None
         self.lights.run_method("show", *by_light(lights), info.prefix, info.pixel_arcsec)
         if self.rows:
             self.summary.set_text(rms_line(self.rows))
+        self.compare()
+
+    @property
+    def end_s(self) -> float:
+        """Time at which the strips end."""
+        ends = [*self.log.get("t_s", ())[-1:], *map(TIME_S, self.rows[-1:])]
+        return max(ends, default=1.0)
+
+    # Comparing with another flight.
+
+    @property
+    def other_run(self) -> KeptRun | None:
+        """The reference, unless it is this flight itself."""
+        kept = self.reference
+        return kept if kept and kept.rows is not self.rows else None
+
+    async def keep(self) -> None:
+        """Keep this flight, to which the next ones are compared."""
+        info = self.page.scene_info
+        assert info is not None
+        shown = told(self.page.state, self.rows)
+        drawn = strips(self.rows, self.log)
+        kept = KeptRun(shown, info.scene, self.rows, drawn, self.end_s)
+        await self.page.ask("keep_flight", True)
+        self.reference = kept
+        self.draw()
+
+    async def forget(self) -> None:
+        """Compare no more."""
+        self.reference = None
+        self.draw()
+        await self.page.ask("keep_flight", False)
+
+    def compare(self) -> None:
+        """Show how this flight differs from the reference."""
+        shown: list[object] = []
+        if self.reference:
+            own = told(self.page.state, self.rows if self.other_run else ())
+            pairs = same_times(self.rows, self.reference.rows)
+            shown += [own, self.reference.shown, len(pairs)]
+        self.comparison.run_method("show", *shown)
+
+    async def switch(self) -> None:
+        """Show the reference's frame nearest to the shown time, or this flight's again."""
+        self.pause()
+        state = self.page.state
+        if state.kind == "photo" and state.photo.startswith(REFERENCE):
+            await self.show_index(self.index)
+            return
+        assert self.reference is not None
+        index = nearest(self.reference.rows, TIME_S(self.rows[self.index]))
+        picture = await self.page.ask("kept_frame", index)
+        if picture is not None:
+            name = f"{REFERENCE} at {TIME_S(self.reference.rows[index]):.2f} s"
+            self.page.show_photo(picture, kind="photo", photo=name)
 
     async def restore(self, t_s: float, when_shown: Callable[[], None]) -> None:
         """Show a moment of the flight again; compute the flight first if it was not kept.
@@ -354,9 +434,7 @@ class RunPanel:
         """Show the frame nearest to a time of the flight."""
         if self.is_ready:
             self.pause()
-            await self.show_index(
-                min(range(len(self.rows)), key=lambda n: abs(TIME_S(self.rows[n]) - t_s))
-            )
+            await self.show_index(nearest(self.rows, t_s))
 
     async def slid(self, event: Any) -> None:
         """Show the frame at the position of the dragged slider; skip all but the newest position."""
@@ -402,17 +480,43 @@ class RunPanel:
         self.page.set_state(kind="flight", t_s=t_s)
         self.seek.set_value(index)
         self.clock.set_text(f"{t_s:.2f} s  {index + 1}/{len(self.rows)}")
-        self.strips.set_moment(t_s)
+        self.page.contents.set(self.strips.id, {"moment": f"{t_s:.4f}"})
         self.page.show_frame(view)
         await self.page.sensor.wait_drawn()
 
     def download(self) -> None:
         assert self.page.scene_info
         table = flight_table(self.rows, self.page.scene_info.scene)
+        if self.other_run:
+            table = with_kept(table, self.page.state.name, self.other_run)
         ui.download(
             widgets.csv_table(table.colnames, table),
             f"{Path(self.page.state.scene).stem}_flight.csv",
         )
+
+
+def nearest(rows: Sequence[FlightRow], t_s: float) -> int:
+    """The row nearest to a time."""
+    return min(range(len(rows)), key=lambda n: abs(TIME_S(rows[n]) - t_s))
+
+
+def told(view: PageView, rows: Sequence[FlightRow]) -> Record:
+    """A flight's name, its command, and what `skysim run --json` prints of its frames, if there are any."""
+    return {
+        "name": view.name,
+        "command": photo.command(forms.absolute_path(view.scene), view.overrides),
+        "run": run_report.summary([one.row for one in rows]) if rows else None,
+    }
+
+
+def with_kept(table: Any, name: str, kept: KeptRun) -> Any:
+    """A flight's table and that of the reference, with the names of both in the column `run`."""
+    from astropy.table import vstack
+
+    other = flight_table(kept.rows, kept.scene)
+    table["run"] = name
+    other["run"] = kept.shown["name"]
+    return vstack([table, other]).filled(math.nan)
 
 
 def flight_table(rows: Sequence[FlightRow], scene: Scene) -> Any:

@@ -43,6 +43,7 @@ from skysim.apps.gui.worker.photo import Photo
 from skysim.apps.gui.worker.session import Session
 from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
+from skysim.simulation.lab import MAIN
 
 PAUSE_S = 0.005  # pause between building parts of a page, in which the keys of other pages are served
 PANELS = ("Run", "Lights", "Scene", "Check", "Survey", "Monte Carlo", "Image", "Log")
@@ -59,8 +60,11 @@ class Tab(context.PageContext):
         Live cameras that it may watch
     filling
         Lock that is held while a form of the scene's keys is filled
+    naming
+        What stands for the reading of LEDs' codes that goes on
     """
 
+    naming: object = None
     new_session: Callable[[], Session | None]
 
     def __init__(
@@ -137,9 +141,7 @@ class Tab(context.PageContext):
         await asyncio.sleep(PAUSE_S)
         self.history = History(self, self.show_query, self.is_settling)
         self.end_step = self.history.end_step
-        self.arrangement = head.Arrangement(
-            [self.run_panel.strips.chart, self.study_panel.chart]
-        )
+        self.arrangement = head.Arrangement(self.study_panel.chart)
         self.actions = Actions(self, self.run_panel.step, self.performers(), self.commands())
         # A timer waits for the browser, and NiceGUI then sends the unfinished page. So timers come after all pauses.
         ui.timer(readouts.UPDATE_S, self.update_lights)
@@ -229,11 +231,36 @@ class Tab(context.PageContext):
         ]
 
     async def identify(self) -> None:
-        """Render a new frame of the live scene, solve it, and log the result."""
+        """Render a new frame of the live scene, solve it, and log the result.
+
+        Where LEDs blink codes, further frames follow until the LEDs are named.
+        """
         self.stop_playback()
-        await self.show_live("render", solve=True)
-        if self.view and self.view.result and self.scene_info:
-            self.log_panel.identified(self.view, self.scene_info)
+        naming = self.naming = object()
+        view: FrameView | None = await self.show_live("render", solve=True)
+        info = self.scene_info
+        frames = 1
+        while (
+            info
+            and frames < info.code_frames
+            and self.naming is naming
+            and not is_solved(view)
+        ):
+            text = (
+                f"reading the LEDs' codes: frame {frames + 1} of at most {info.code_frames}"
+            )
+            self.show_message(f"{text}; a movement stops it", "quiet")
+            view = await self.show_live("render_next", frames, solve=True)
+            await self.sensor.wait_drawn()
+            frames += 1
+        if view and view.result and info:
+            self.log_panel.identified(view, info)
+            names = [
+                self.sensor.name(one.id) for one in view.result.detections if one.id >= 0
+            ]
+            if frames > 1 and self.naming is naming:
+                found = ", ".join(names) or view.result.row.status
+                self.show_message(f"after {frames} frames: {found}", "quiet")
 
     async def start_study(self) -> None:
         self.show_panel("Monte Carlo")
@@ -279,9 +306,10 @@ class Tab(context.PageContext):
     async def restore(self, wanted: PageView) -> None:
         """Restore a view: open its scene if it is another one, point the camera, then fly or replay."""
         now = self.state
-        is_shown = self.view is not None and now.opened == wanted.opened
+        is_same = now.opened == wanted.opened and now.head == wanted.head
+        is_shown = self.view is not None and is_same
         if not is_shown or wanted.angles_deg is None:
-            if not await self.open(*wanted.opened, wanted.angles_deg):
+            if not await self.open(*wanted.opened, wanted.angles_deg, wanted.head):
                 return
         elif wanted.kind == "live" and (
             now.kind != "live" or now.angles_deg != wanted.angles_deg
@@ -295,7 +323,7 @@ class Tab(context.PageContext):
         elif wanted.kind == "replay" and wanted.study == self.state.study:
             await self.study_panel.replay(wanted.trial)
         elif wanted.kind == "photo":
-            self.show_message(f"{wanted.photo}: drop the image again to see it", "quiet")
+            self.show_message(f"{wanted.photo}: show the image again to see it", "quiet")
 
     def is_settling(self) -> bool:
         """Whether the page does not show its state yet."""
@@ -308,6 +336,7 @@ class Tab(context.PageContext):
         scene: str,
         overrides: OverrideTexts | None = None,
         angles_deg: Triple | None = None,
+        head: str = MAIN,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
         self.stop_playback()
@@ -318,9 +347,8 @@ class Tab(context.PageContext):
             self.sensor.show_setting_up(scene)
         path = forms.absolute_path(scene)
         activity = f"setting up {name} …" if self.view else ""
-        result = await self.run_task(
-            "open", path, overrides, self.solving, angles_deg, activity=activity
-        )
+        asked = path, overrides, self.solving, angles_deg, head
+        result = await self.run_task("open", *asked, activity=activity)
         if result is None:
             self.head.picker.set_value(self.state.scene)
             if self.view is None:
@@ -329,7 +357,9 @@ class Tab(context.PageContext):
                 )
             return False
         self.scene_info, view = result
-        self.set_state(scene=scene, overrides=overrides, study=self.study_panel.running)
+        head = self.scene_info.head
+        running = self.study_panel.running
+        self.set_state(scene=scene, overrides=overrides, study=running, head=head)
         self.set_scene(self.scene_info)
         self.show_frame(view, kind="live", angles_deg=view.angles_deg)
         self.form.hide_others(scene)
@@ -401,9 +431,15 @@ class Tab(context.PageContext):
 
     def stop_playback(self) -> None:
         """Stop playback, a pushed vehicle and the live camera before the sensor view shows something else."""
+        self.naming = None
         self.run_panel.pause()
         self.scene_3d.push.stop()
         self.photo.stop()
+
+
+def is_solved(view: FrameView | None) -> bool:
+    """Whether a frame has an attitude, or there is none to wait for."""
+    return view is None or view.result is None or view.result.row.estimate_deg is not None
 
 
 SETTLED = (

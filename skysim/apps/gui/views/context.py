@@ -27,6 +27,7 @@ from skysim.apps.gui.worker.session import Session, WorkerLost
 from skysim.core.errors import InputError
 from skysim.core.types import Record, frozen
 from skysim.core.yaml_reader import OverrideTexts
+from skysim.simulation.lab import MAIN
 
 
 class PageContext:
@@ -181,6 +182,7 @@ class PageContext:
         scene: str,
         overrides: OverrideTexts | None = None,
         angles_deg: Triple | None = None,
+        head: str = MAIN,
     ) -> bool:
         """Set up a scene and show a first frame, at its start or at other angles; keep the old scene if that fails."""
         raise NotImplementedError
@@ -193,7 +195,7 @@ class PageContext:
             kept = {
                 key: text for key, text in self.state.overrides.items() if key not in dropped
             }
-            await self.open(self.state.scene, {**kept, **overrides})
+            await self.open(self.state.scene, {**kept, **overrides}, head=self.state.head)
 
     # Notifications.
 
@@ -269,6 +271,8 @@ class PageView:
         Folder of the study in the Monte Carlo panel, and the trial that is replayed
     photo
         Name of the image that is not of the scene
+    head
+        Name of the scene's camera that is shown
     """
 
     scene: str
@@ -279,6 +283,14 @@ class PageView:
     study: str = ""
     trial: int = -1
     photo: str = ""
+    head: str = MAIN
+
+    @property
+    def name(self) -> str:
+        """The scene with its overrides, and the camera if it is a further one."""
+        camera = [f"camera {self.head}"] * (self.head != MAIN)
+        overrides = map("=".join, self.overrides.items())
+        return ", ".join((Path(self.scene).stem, *overrides, *camera))
 
     @property
     def opened(self) -> tuple[str, Mapping[str, str]]:
@@ -305,6 +317,7 @@ class PageView:
             ("study", self.study),
             ("trial", str(self.trial) if self.kind == "replay" else ""),
             ("photo", self.photo if self.kind == "photo" else ""),
+            ("head", self.head if self.head != MAIN else ""),
         )
         return "?" + urlencode(pairs + [pair for pair in optional if pair[1]])
 
@@ -346,8 +359,8 @@ class PageView:
             raise InputError("link", "at", "three angles in degrees; t: seconds")
         overrides = dict(value.partition("=")[::2] for key, value in pairs if key == "set")
         study = one.get("study", "")
-        photo = one.get("photo", "")
-        return cls(one["scene"], overrides, kind, angles, t_s, study, trial, photo)  # type: ignore[arg-type]
+        names = one.get("photo", ""), one.get("head", MAIN)
+        return cls(one["scene"], overrides, kind, angles, t_s, study, trial, *names)  # type: ignore[arg-type]
 
     def same_step(self, other: PageView) -> bool:
         """Whether only attitude or time differ, which change continuously."""

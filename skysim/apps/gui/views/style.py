@@ -124,6 +124,11 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-run {{ display: flex; flex-direction: column; gap: 2px }} .lab-panels .q-tab-panel > * {{ flex: none }}
 .lab-moment {{ position: absolute; left: 0; top: 0; bottom: 0; width: 1.5px; pointer-events: none;
   background: {CURVE_COLORS[0]} }} .lab-moment[hidden] {{ display: none }}
+.lab-strips {{ position: relative; width: 100% }}
+.lab-compared {{ width: 100%; padding: 4px 0 8px; border-top: 1px solid {COLORS["line"]} }}
+.lab-compared > .mono {{ white-space: pre-wrap; overflow-wrap: anywhere; padding-left: 20px; text-indent: -20px }}
+.lab-compared > [data-run=own]::before {{ content: "● "; color: {CURVE_COLORS[0]} }}
+.lab-compared > [data-run=reference]::before {{ content: "◇ " }}
 .lab-timeline {{ width: 100% }} .lab-timeline .lane {{ position: relative; height: 26px;
   border-bottom: 1px solid {COLORS["line"]} }}
 .lab-timeline span {{ position: absolute; left: 0; font-size: 11px; line-height: 14px; pointer-events: none }}
@@ -215,7 +220,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
     grid-template-areas: "head" "sensor" "side" "keys" }}
   .lab-head {{ flex-wrap: wrap; row-gap: 0; min-height: 44px }} .lab .lab-split {{ display: none }}
   .lab-scene {{ flex: 1 1 150px }}
-  .lab-said {{ text-align: left; flex-basis: 120px }}
+  .lab-said {{ text-align: left; flex-basis: 120px }} .lab-said:empty {{ flex-basis: 0 }}
   .lab-keys {{ flex-wrap: wrap; padding: 6px 14px; row-gap: 4px }}
   .lab-sensor {{ grid-template-rows: auto calc(min(70vh, 75vw) + 200px) }}
   .lab-bar {{ flex-wrap: wrap; padding: 4px 14px }}

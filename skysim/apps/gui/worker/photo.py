@@ -7,6 +7,7 @@ import math
 import shlex
 import tempfile
 import zipfile
+from collections.abc import Mapping
 from dataclasses import asdict, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -132,7 +133,8 @@ def photo_from_trial(study: str, folder: Path, trial: int) -> PhotoPixels:
     setup = trials.prepared_setup(plan.spec, segment.settings)
     lab = setup.lab
     frame, truth, report = runner.replayed_frame(setup, row.seed)
-    bench = Workbench(lab.scene, lab, setup.estimator, lab.start, lenses.scene_lens(lab), {})
+    lens = lenses.scene_lens(lab)
+    bench = Workbench(lab.scene, lab, setup.estimator, lab.start, lens, {}, lab)
     bench.magnitude = workbench.magnitude_by_id(lab)
     photo = scene_photo(bench, bench.frame_view(frame, truth, report, 0.0))
     if row.error:
@@ -238,11 +240,16 @@ def frame_files(
         solution = file_io.to_json(solution_record(workbench.result))
         contents["solution.json"] = solution.encode()
     name = base_reference(base)
-    sets = [word for pair in overrides.items() for word in ("--set", "=".join(pair))]
     contents["scene.yaml"] = scene_yaml(name, overrides).encode()
-    contents["command.txt"] = shlex.join(["skysim", "run", name, *sets]).encode()
+    contents["command.txt"] = command(base, overrides).encode()
     contents["scene.py"] = PYTHON.format(name, overrides).encode()
     return contents
+
+
+def command(scene: str, overrides: Mapping[str, str]) -> str:
+    """The command line that runs a scene with overrides."""
+    sets = [word for pair in overrides.items() for word in ("--set", "=".join(pair))]
+    return shlex.join(["skysim", "run", base_reference(scene), *sets])
 
 
 def photo_files(photo: Photo, image: NDArray) -> dict[str, bytes]:

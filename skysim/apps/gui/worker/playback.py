@@ -97,12 +97,11 @@ class Playback:
         self.bench = bench
         self.frames = list[KeptFrame]()
         self.file = tempfile.TemporaryFile()  # noqa: SIM115
-        flight = self.flight = Flight(bench.lab)
+        flight = self.flight = Flight(bench.whole)
         self.shown: int | None = None
         self.reported = 0
-        self.events = flight.events(
-            flight.filter_schedules or flight.schedules[:1], solves=True
-        )
+        own = flight.schedules[bench.head : bench.head + 1]
+        self.events = flight.events(flight.filter_schedules or own, solves=True)
 
     def advance(self, budget_s: float) -> FlightStep:
         """Compute for about budget_s, and report the progress."""
@@ -180,7 +179,7 @@ class Playback:
             return
         kept = self.frames[self.shown]
         bench = self.bench
-        bench.frame, bench.truth = self.flight.render(self.shown)
+        bench.frame, bench.truth = self.flight.render(self.shown, bench.head)
         bench.report = kept.report
         bench.result = kept.view.result
 

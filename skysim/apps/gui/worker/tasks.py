@@ -31,6 +31,7 @@ from skysim.core.errors import InputError
 from skysim.core.yaml_reader import OverrideTexts
 from skysim.simulation import checks
 from skysim.simulation.checks.plan_check import Check
+from skysim.simulation.lab import MAIN
 
 KEPT_IMAGES = 3  # number of newest images that are kept: the page may show an earlier one
 
@@ -47,6 +48,8 @@ class Worker:
         Newest images for the page by number, each with its saturation value
     number
         Number of the last image
+    flight, reference
+        The scene's flight, and the one that is kept for comparison
     pushed
         Motion of the pushed vehicle, as long as the workbench has its attitude
     surveyed
@@ -64,6 +67,7 @@ class Worker:
     shown: dict[int, tuple[pixels.PixelLevels, float]] = field(default_factory=dict)
     number: int = 0
     flight: playback.Playback | None = None
+    reference: playback.Playback | None = None
     pushed: geometry.Push | None = None
     surveyed: playback.Survey | None = None
     other: photo.PhotoPixels | None = None
@@ -102,7 +106,7 @@ class Worker:
     @property
     def survey_of_scene(self) -> playback.Survey:
         """The survey of the current scene. Raises InputError if none was planned."""
-        if self.surveyed is None or not self.surveyed.is_of(self.workbench.scene):
+        if self.surveyed is None or not self.surveyed.is_of(self.workbench.whole.scene):
             raise InputError("", "no survey of this scene: plan one")
         return self.surveyed
 
@@ -135,6 +139,7 @@ class Worker:
         overrides: OverrideTexts,
         solve: bool,
         angles_deg: Triple | None = None,
+        head: str = MAIN,
     ) -> tuple[SceneInfo, FrameView]:
         """Set up a scene and render a first frame.
 
@@ -142,8 +147,10 @@ class Worker:
         ----------
         angles_deg
             Attitude, if it is neither the kept one nor the start
+        head
+            Name of the camera; the main one if there is no such head
         """
-        bench = Workbench.open(scene, overrides, self.current)
+        bench = Workbench.open(scene, overrides, self.current, head)
         if angles_deg is not None:
             bench.lab_from_body = geometry.from_angles(bench.lab, angles_deg)
         self.current = bench
@@ -151,12 +158,16 @@ class Worker:
         self.overrides = dict(overrides)
         self.flight = None
         self.pushed = None
-        surveyed = self.surveyed is not None and self.surveyed.is_of(bench.scene)
+        surveyed = self.surveyed is not None and self.surveyed.is_of(bench.whole.scene)
         return bench.scene_info._replace(surveyed=surveyed), self.render(solve)
 
-    def render(self, solve: bool) -> FrameView:
-        view = self.workbench.render_at_rest(solve)
+    def render(self, solve: bool, index: int = 0) -> FrameView:
+        view = self.workbench.render_at_rest(solve, index)
         return self.show_frame(view, self.levels)
+
+    def render_next(self, index: int, solve: bool) -> FrameView:
+        """Render a later frame of the run at rest that `render` has begun."""
+        return self.render(solve, index)
 
     def point(self, angles_deg: Triple, solve: bool) -> FrameView:
         bench = self.workbench
@@ -189,14 +200,14 @@ class Worker:
 
     def check(self) -> Check:
         """The facts of the scene and its warnings, as `skysim check` prints them."""
-        return checks.check(self.workbench.lab)
+        return checks.check(self.workbench.whole)
 
     def ambiguity(self) -> AmbiguityMap:
         return ambiguity(self.workbench.lab)
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""
-        self.surveyed, plan = playback.begin(self.workbench.scene, frames)
+        self.surveyed, plan = playback.begin(self.workbench.whole.scene, frames)
         return plan
 
     def adjust_survey(self, frames: int) -> SurveyFound:
@@ -228,6 +239,19 @@ class Worker:
         if self.flight is None or not 0 <= index < len(self.flight.frames):
             raise InputError("", f"the flight has no frame {index}")
         return self.show_frame(*self.flight.show(index))
+
+    def keep_flight(self, keeps: bool) -> None:
+        """Keep the flight as the reference of further ones, or keep none."""
+        self.reference = self.flight if keeps else None
+
+    def kept_frame(self, index: int) -> photo.Photo:
+        """A frame of the reference. Raises InputError if there is none."""
+        kept = self.reference
+        if kept is None:
+            raise InputError("", "the reference's frames were lost with their worker")
+        picture = photo.scene_photo(kept.bench, kept.frames[index].view)
+        frame, _ = kept.flight.render(index, kept.bench.head)
+        return self.show_photo((picture, frame.image_dn))
 
     def replay(self, study: str, folder: str, trial: int) -> photo.Photo:
         """Repeat a study's trial; the page shows its frame."""

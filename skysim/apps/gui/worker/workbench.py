@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import project
 from estimator.core.types import Attitude
+from estimator.trackers.coded_tracker import CodedTracker
 from estimator.trackers.dome_tracker import DomeTracker
 from estimator.trackers.pipeline import Clock, Report
 from estimator.trackers.star_tracker import StarTracker
@@ -35,10 +36,18 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import PRESCRIBED
 from skysim.simulation import checks, exposure
 from skysim.simulation.compilation import warm_up
-from skysim.simulation.lab import Lab, StarCamera, build_lab, build_tracker, frame_end_s
+from skysim.simulation.lab import (
+    MAIN,
+    Lab,
+    StarCamera,
+    build_lab,
+    build_tracker,
+    frame_end_s,
+)
 from skysim.tracking import factory, onboard_model
 
 MAX_WINDOWS = 200
+CODE_RUNS = 2  # repetitions of the LEDs' codes after which unnamed LEDs remain unnamed
 
 
 @dataclass
@@ -47,6 +56,10 @@ class Workbench:
 
     Attributes
     ----------
+    scene, lab
+        The scene as the shown camera sees it, and the laboratory with this camera as the main one
+    whole, head
+        The laboratory with all cameras, and the number of the shown one
     lens
         Directions of the camera's pixels
     geometry
@@ -63,6 +76,8 @@ class Workbench:
     lab_from_body: Rotation
     lens: Lens
     geometry: Record
+    whole: Lab
+    head: int = 0
     rendered_count: int = 0
     frame: Frame | None = None
     truth: Truth | None = None
@@ -72,35 +87,43 @@ class Workbench:
 
     @classmethod
     def open(
-        cls, name: str, overrides: Mapping[str, str], before: Workbench | None = None
+        cls,
+        name: str,
+        overrides: Mapping[str, str],
+        before: Workbench | None = None,
+        head: str = MAIN,
     ) -> Workbench:
-        """Set up a scene, or keep `before` if it is the same.
+        """Set up a scene for a head of that name, or else its main camera; keep `before` if it is the same.
 
-        If only the tracker differs from `before`, its lab is kept; if only tracker and camera differ, its attitude.
+        If only the tracker differs from `before`, its lab is kept; if only tracker and cameras differ, its attitude.
 
         Raises
         ------
         InputError
         """
         scene = load(name, overrides)
-        if before and before.scene == scene:
-            return before
-        if before and before.scene.with_values(tracker=scene.tracker) == scene:
-            lab = before.lab.with_scene(scene)
-            return replace(before, scene=scene, lab=lab, estimator=warm_tracker(lab))
-        lab = build_lab(scene)
-        same = (
-            before
-            and before.scene.with_values(tracker=scene.tracker, camera=scene.camera) == scene
-        )
-        lab_from_body = before.lab_from_body if before and same else lab.start
-        views = geometry.scene_lens(lab), geometry.lab_geometry(lab)
+        former = before.whole.scene if before else None
+        keeps_lab = former and former.with_values(tracker=scene.tracker) == scene
+        whole = before.whole.with_scene(scene) if before and keeps_lab else build_lab(scene)
+        names = [camera.name for camera in whole.cameras]
+        number = names.index(head) if head in names else 0
+        lab = whole.of_camera(number) if number else whole
+        if before and keeps_lab and before.head == number:
+            if former == scene:
+                return before
+            tracker = warm_tracker(lab)
+            return replace(before, scene=lab.scene, lab=lab, whole=whole, estimator=tracker)
+        hardware = {"tracker": scene.tracker, "camera": scene.camera}
+        keeps_attitude = former and former.with_values(**hardware) == scene
         return cls(
-            scene,
+            lab.scene,
             lab,
             warm_tracker(lab),
-            lab_from_body,
-            *views,
+            before.lab_from_body if before and keeps_attitude else lab.start,
+            geometry.scene_lens(lab),
+            geometry.lab_geometry(lab),
+            whole,
+            number,
             magnitude=magnitude_by_id(lab),
         )
 
@@ -117,10 +140,15 @@ class Workbench:
             lens.field_deg[0],
             lens.arcsec_px,
             {name: getattr(settings, name) for name in factory.STAR_ALGORITHMS},
-            self.lab.duration_s,
+            self.whole.duration_s,
             scene.camera.detector.noise,
             self.geometry,
             self.lens,
+            heads=tuple(camera.name for camera in self.whole.cameras),
+            head=self.lab.camera.name,
+            code_frames=CODE_RUNS * self.estimator.tracks.frames
+            if isinstance(self.estimator, CodedTracker)
+            else 0,
         )
 
     def scene_at_rest(self) -> dict[str, str]:
@@ -144,22 +172,31 @@ class Workbench:
         }
         return {f"motion.{key}": yaml_line(value) for key, value in motion.items()}
 
-    def render_at_rest(self, solve: bool = False) -> FrameView:
-        """Render a frame at the current attitude at rest, with independent noise; solve it if `solve`."""
-        camera = self.next_run().camera
-        return self.render(
-            camera, Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, 0)), solve
-        )
+    def render_at_rest(self, solve: bool = False, index: int = 0) -> FrameView:
+        """Render a frame of a run at the current attitude at rest; solve it if `solve`.
+
+        Frame 0 begins another run. Only the later ones of the same run show an LED's next bits.
+        """
+        run = self.run if index else self.next_run()
+        trajectory = Trajectory.at_rest(self.lab_from_body, frame_end_s(self.scene, index))
+        return self.render(run.camera, trajectory, solve, index)
+
+    @property
+    def run(self) -> Lab:
+        """The lab of the newest run."""
+        return self.lab.in_run(self.scene.seed + self.rendered_count)
 
     def next_run(self) -> Lab:
         """The lab of the next run, with independent noise."""
         self.rendered_count += 1
-        return self.lab.in_run(self.scene.seed + self.rendered_count)
+        return self.run
 
-    def render(self, camera: StarCamera, trajectory: Trajectory, solve: bool) -> FrameView:
-        """Render frame 0 of a camera in motion, solve it if `solve`, and return the view for the page."""
+    def render(
+        self, camera: StarCamera, trajectory: Trajectory, solve: bool, index: int = 0
+    ) -> FrameView:
+        """Render a frame of a camera in motion, solve it if `solve`, and return the view for the page."""
         clock = Clock()
-        self.frame, self.truth = exposure.render_frame(camera, trajectory, 0)
+        self.frame, self.truth = exposure.render_frame(camera, trajectory, index)
         self.report = factory.solve_frame(self.estimator, self.frame) if solve else None
         clock.lap("all")
         view = self.frame_view(self.frame, self.truth, self.report, clock.seconds["all"])
