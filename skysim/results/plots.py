@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.types import Floats, SourceTruth
-from skysim.sources.satellites import light_name
 
 Picture = NDArray[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
 Color = tuple[int, int, int]  # BGR
@@ -246,6 +245,9 @@ def annotate_truth(image: NDArray, sources: SourceTruth) -> Picture:
 
     Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
     """
+    # Here, since it imports the sections of a scene, which the picture of a solved file does without.
+    from skysim.sources.satellites import light_name
+
     picture, scale, size = enlarged(image)
     labeled = set(np.argsort(-sources.electrons)[:40].tolist())
     seen = visible(sources)
