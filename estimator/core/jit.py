@@ -22,9 +22,10 @@ jit = partial(
 )
 
 COMPILATION = event.TimingListener()
-event.register("numba:compile", COMPILATION)
+# numba holds the lock while it compiles a function, and while it loads compiled code.
+event.register("numba:compiler_lock", COMPILATION)
 
 
 def compiled_s() -> float:
-    """Return the seconds that this process has spent on compilation, not on loading compiled code."""
+    """Return the seconds that this process has spent on compiling functions and on loading compiled code."""
     return float(COMPILATION.duration) if COMPILATION.done else 0.0

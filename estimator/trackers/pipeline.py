@@ -216,7 +216,7 @@ class Report:
 
 
 class Clock:
-    """Stopwatch: accumulated seconds between laps, by name. It stands still while a function is compiled."""
+    """Stopwatch: accumulated seconds between laps, by name. It stands still while a function is compiled or loaded."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}

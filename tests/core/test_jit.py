@@ -13,7 +13,7 @@ from skysim.core.jit import CompilationNotice
 def test_compilation_is_noted_once_and_others_hear_of_all_of_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The time of compilation, which no stage counts, is taken by a listener that numba calls after the note's."""
+    """numba skips the next listener if one leaves while it calls them in turn."""
     notes: list[str] = []
     monkeypatch.setattr(errors, "note", notes.append)
     with (
