@@ -1,4 +1,4 @@
-# Everything a newcomer needs: `make demo` and `make test`. Both set up .venv by themselves.
+# Everything a newcomer needs: `make demo` and `make test`. Both set up .venv by themselves; `make setup` also compiles.
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
@@ -28,6 +28,7 @@ extras: $(READY)
 
 .PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
 setup: $(READY)
+	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.helpers.compilation --basic
 
 demo: $(READY)
 	$(BIN)/skysim run afit_simsat --out out/afit_simsat

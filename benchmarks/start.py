@@ -16,7 +16,10 @@ COMMANDS = {
     "--help": 0.5,
     "scenes": 0.3,
     "validate shefex2": 1.0,
+    "validate afit_simsat": 1.0,
+    "check afit_simsat": 1.3,
     "solve frame_0000.png --fov 14.87": 1.0,
+    "run afit_simsat --frames 1": 2.0,
     "run shefex2 --frames 1": 3.0,
 }
 

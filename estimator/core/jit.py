@@ -1,4 +1,4 @@
-"""Compiler options of all numba functions.
+"""Compiler options of all numba functions, and the time that compilation takes.
 
 Options that a callee leaves out are inherited from the caller that compiles it first, and are cached on disk. We set
 them all, so that the results (division by zero, order of summation) do not depend on the order of calls.
@@ -7,6 +7,7 @@ them all, so that the results (division by zero, order of summation) do not depe
 from functools import partial
 
 import numba
+from numba.core import event
 
 # The GIL is released, so that threads of one process can search at once.
 # No wrapper for C callbacks is compiled, since no compiled function is passed as a value.
@@ -19,3 +20,12 @@ jit = partial(
     no_cfunc_wrapper=True,
     nogil=True,
 )
+
+COMPILATION = event.TimingListener()
+# numba holds the lock while it compiles a function, and while it loads compiled code.
+event.register("numba:compiler_lock", COMPILATION)
+
+
+def compiled_s() -> float:
+    """Return the seconds that this process has spent on compiling functions and on loading compiled code."""
+    return float(COMPILATION.duration) if COMPILATION.done else 0.0

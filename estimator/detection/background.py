@@ -17,8 +17,8 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter
 
 from estimator.core.checks import Floats
 from estimator.core.constants import SIGMA_PER_MAD
@@ -130,7 +130,7 @@ def flattened(image: NDArray, saturation: float) -> NDArray:
     padding = ((0, -height % BIN_PX), (0, -width % BIN_PX))
     light = np.pad(image, padding, mode="edge").astype(np.float32)
     bins = light.reshape(len(light) // BIN_PX, BIN_PX, -1, BIN_PX).mean(axis=(1, 3))
-    mean = partial(uniform_filter, size=WINDOW, mode="nearest")
+    mean = partial(scipy.ndimage.uniform_filter, size=WINDOW, mode="nearest")
     once = mean(bins)
     sky = 2 * once - mean(once)
     # 2. Stars
@@ -184,7 +184,7 @@ def without_smear(image: NDArray, saturation: float) -> tuple[NDArray, NDArray]:
     column = rows[tail : len(rows) - tail].mean(axis=0)
     noise = rows[tail : len(rows) - tail].std(axis=0)
     # 2. Smear
-    base = median_filter(column, TILE_PX + 1, mode="nearest")
+    base = scipy.ndimage.median_filter(column, TILE_PX + 1, mode="nearest")
     excess = column - base
     smeared = excess > CLIP_SIGMA * SIGMA_PER_MAD * np.median(np.abs(excess))
     if not smeared.any():

@@ -21,7 +21,6 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d
 
 from estimator.core.checks import Floats, Ints, native, number, of_type
 from estimator.core.errors import ImageError
@@ -531,7 +530,7 @@ def noise_factor(taps: Ints) -> float:
     kernel = np.zeros((2 * reach + 1, 2 * reach + 1))
     np.add.at(kernel, tuple((taps + reach).T), 1 / len(taps))
     for axis in (0, 1):
-        kernel = correlate1d(kernel, [0.25, 0.5, 0.25], axis)
+        kernel = kernel / 2 + (np.roll(kernel, 1, axis) + np.roll(kernel, -1, axis)) / 4
     return float(np.sqrt(np.sum(kernel**2)))
 
 

@@ -27,6 +27,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera, check_frame
 from estimator.core.checks import Allowed, Floats, Ints, Step, frozen
 from estimator.core.errors import ImageError
+from estimator.core.jit import compiled_s
 from estimator.core.types import (
     THESIS_INTENSITY,
     Attitude,
@@ -215,15 +216,15 @@ class Report:
 
 
 class Clock:
-    """Stopwatch: accumulated seconds between laps, by name."""
+    """Stopwatch: accumulated seconds between laps, by name. It stands still while a function is compiled or loaded."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
-        self._last = time.perf_counter()
+        self._last = time.perf_counter() - compiled_s()
 
     def lap(self, name: str) -> None:
         """Add the time since the last lap to a name's seconds."""
-        now = time.perf_counter()
+        now = time.perf_counter() - compiled_s()
         self.seconds[name] = self.seconds.get(name, 0.0) + now - self._last
         self._last = now
 

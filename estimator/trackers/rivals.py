@@ -171,4 +171,7 @@ def _is_comparable(matches: int, fewer: int, share: float) -> bool:
 def _find(lights: FlatCentroids, sensor: Sensor, sky: SkyIndex, rest: NDArray) -> Solution:
     """Search some rows of the lights for a second sky: step 2 of the module; one call of compiled code is faster."""
     detections = chosen(detections_of(lights, sensor, 0.0), rest)
-    return star_search.lost_in_space(detections, sky, MOST_LIGHTS, MAX_CHECKS)
+    # Not as constants, for which numba would compile the whole search once more.
+    return star_search.lost_in_space(
+        detections, sky, np.int64(MOST_LIGHTS), np.int64(MAX_CHECKS)
+    )

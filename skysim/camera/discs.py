@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy import fft, ndimage
+import scipy
 
 from skysim.camera.optics import Optics
 from skysim.camera.projection import (
@@ -218,12 +218,14 @@ def convolved(light: Floats, patches: Floats) -> Floats:
     """
     steps, _, height, width = patches.shape
     full = (len(light) // steps + height - 1, len(light) // steps + width - 1)
-    shape = [fft.next_fast_len(size, real=True) for size in full]
+    shape = [scipy.fft.next_fast_len(size, real=True) for size in full]
     # (q, p, row, column): the lattice's points by their phase.
     by_phase = light.reshape(len(light) // steps, steps, -1, steps).transpose(1, 3, 0, 2)
     # Convolutions are products of spectra, which add before the one inverse transform.
-    spectrum = (fft.rfft2(by_phase, shape) * fft.rfft2(patches, shape)).sum(axis=(0, 1))
-    return np.maximum(fft.irfft2(spectrum, shape)[: full[0], : full[1]], 0.0)
+    spectrum = (scipy.fft.rfft2(by_phase, shape) * scipy.fft.rfft2(patches, shape)).sum(
+        axis=(0, 1)
+    )
+    return np.maximum(scipy.fft.irfft2(spectrum, shape)[: full[0], : full[1]], 0.0)
 
 
 def light_on_lattice(
@@ -331,7 +333,7 @@ def whole(
     """The truth of one body, as one row, from its own light on a part of the image that begins at corner_px (x, y)."""
     electrons = own_e.sum(dtype=float)
     y, x = np.unravel_index(np.argmax(own_e), own_e.shape)
-    center = np.array(ndimage.center_of_mass(own_e.astype(float)))[::-1]
+    center = np.array(scipy.ndimage.center_of_mass(own_e.astype(float)))[::-1]
     return SourceTruth(
         id=np.array([body.id]),
         xy_px=center_px[None],

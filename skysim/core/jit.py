@@ -21,12 +21,16 @@ jit = partial(
 class CompilationNotice(event.Listener):
     """Listener that prints a note at the first compilation; functions from numba's cache are not compiled."""
 
+    told = False
+
     def on_start(self, _: event.Event) -> None:
         """Called by numba before it compiles a function."""
-        event.unregister("numba:compile", self)
-        errors.note(
-            "compiling numba functions (once after an installation or update): about a minute"
-        )
+        # It stays registered: if a listener leaves while numba calls them in turn, numba skips the next.
+        if not self.told:
+            errors.note(
+                "compiling numba functions (once after an installation or update): about a minute"
+            )
+        self.told = True
 
     def on_end(self, _: event.Event) -> None:
         """Required by the interface; prints nothing."""

@@ -9,7 +9,6 @@ import numpy as np
 
 from skysim.core.constants import SIGMA_PER_MAD
 from skysim.core.types import Array, Bools, Floats, Record, SourceTruth, median
-from skysim.sources.satellites import light_name
 
 Picture = Array[np.uint8]  # (H, W) gray, or (H, W, 3) BGR
 Color = tuple[int, int, int]  # BGR
@@ -243,6 +242,9 @@ def annotate_truth(image: Array, sources: SourceTruth) -> Picture:
 
     Blue marks unsaturated sources, red those expected to saturate. A frame smaller than 1000 pixels is enlarged twice.
     """
+    # Here, since it imports the sections of a scene, which the picture of a solved file does without.
+    from skysim.sources.satellites import light_name
+
     picture, scale, size = enlarged(image)
     labeled = set(np.argsort(-sources.electrons)[:40].tolist())
     seen = visible(sources)

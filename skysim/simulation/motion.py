@@ -189,6 +189,7 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
     disturbances = build_disturbances(lab, (), period_s)
     needed = np.zeros((len(t_s), 3))
     given = np.zeros((len(t_s), 3))
+    owed = np.zeros(3)
     used_kg = 0.0
     following = reference.state_at(0.0)
     for k, t in enumerate(t_s.tolist()):
@@ -204,9 +205,10 @@ def forecast_torque(lab: Lab) -> TorqueForecast | None:
         needed[k] -= disturbances.torque_nm(ends_s, attitude, rate, momentum)[0]
         # 2. Allocation and response.
         inputs = ControlInput(t, period_s, rate, angles, speeds)
-        owed = (needed - given).sum(axis=0)
-        controls = computer.compute_controls(inputs, attitude, momentum, Commands(owed))
+        commands = Commands(owed + needed[k])
+        controls = computer.compute_controls(inputs, attitude, momentum, commands)
         given[k] = computer.achieved_nm
+        owed += needed[k] - given[k]
         if scene.vehicle.thrusters:
             impulses_ns = controls[vehicle.thrusters.motor] * period_s
             used_kg += float(propellant_kg(impulses_ns, scene.vehicle.thrusters).sum())

@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import erfa
 import numpy as np
+import scipy
 from numpy.random import Generator
 from scipy import special
-from scipy.interpolate import RectBivariateSpline
 
 from skysim.core.time import tt_jd, ut1_jd
 from skysim.core.types import Bools, Floats, Ints, Sources, frozen
@@ -76,7 +76,7 @@ def variance(
 @lru_cache(maxsize=8)
 def variance_table(
     aperture_m: float, height_m: float, wavelength_m: float
-) -> RectBivariateSpline:
+) -> "scipy.interpolate.RectBivariateSpline":
     """The logarithm of the variance as a spline in the logarithms of air mass and exposure.
 
     1. Layers of the model atmosphere, scaled so that the limit of wide apertures and long exposures is Young's law,
@@ -100,7 +100,9 @@ def variance_table(
     # 3. (air masses, exposures), as a product of matrices.
     moved = exposure_filter(EXPOSURES_S[:, None, None] * wind_m_s[:, None] * f)
     found = spectra.reshape(len(AIR_MASSES), -1) @ moved.reshape(len(EXPOSURES_S), -1).T
-    return RectBivariateSpline(np.log(AIR_MASSES), np.log(EXPOSURES_S), np.log(found))
+    return scipy.interpolate.RectBivariateSpline(
+        np.log(AIR_MASSES), np.log(EXPOSURES_S), np.log(found)
+    )
 
 
 def layers(height_m: float) -> tuple[Floats, Floats]:

@@ -9,7 +9,7 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import erfa
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 from scipy.spatial import cKDTree
 
 from skysim.core.constants import (
@@ -393,7 +393,9 @@ def sample(
     return joined(parts)
 
 
-def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpline:
+def place_spline(
+    name: str, start: datetime.datetime, last_s: float
+) -> "scipy.interpolate.CubicSpline":
     """A body's place (3,) from the Earth's center in m, as a spline in seconds since the start."""
     ephemeris = load_ephemeris()
     first_jd = tt_jd(start)
@@ -402,4 +404,6 @@ def place_spline(name: str, start: datetime.datetime, last_s: float) -> CubicSpl
     dates = first_jd + nodes_s / DAY_S
     earth_km = [ephemeris.position_km("earth", jd) for jd in dates]
     body_km = [ephemeris.barycentric_km(name, jd) for jd in dates]
-    return CubicSpline(nodes_s, 1e3 * (np.array(body_km) - np.array(earth_km)))
+    return scipy.interpolate.CubicSpline(
+        nodes_s, 1e3 * (np.array(body_km) - np.array(earth_km))
+    )

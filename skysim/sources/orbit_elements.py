@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import erfa
 import numpy as np
-from scipy.interpolate import BPoly
+import scipy
 
 from skysim.core.constants import DAY_S, EARTH_J2, EARTH_MU_M3_S2, EARTH_RADIUS_M
 from skysim.core.errors import InputError, Where
@@ -273,7 +273,7 @@ class OemOrbit(NamedTuple):
 
     source: str
     t_s: Floats
-    path: BPoly
+    path: "scipy.interpolate.BPoly"
 
     def states(self, after_s: Floats) -> GcrsState:
         """(K, 3) positions and velocities at K times. Raises InputError outside the samples."""
@@ -325,7 +325,9 @@ def read_oem(path: str, start: datetime.datetime) -> OemOrbit:
     # 3.
     missing = np.isnan(samples[:, 6])
     samples[missing, 6:] = gravity_m_s2(samples[missing, :3])
-    return OemOrbit(path, t_s, BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3)))
+    return OemOrbit(
+        path, t_s, scipy.interpolate.BPoly.from_derivatives(t_s, samples.reshape(-1, 3, 3))
+    )
 
 
 def gravity_m_s2(position_m: Floats) -> Floats:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
+import scipy
 
 from skysim.core.constants import (
     STANDARD_PRESSURE_HPA,
@@ -205,7 +205,7 @@ class Refraction:
             )
         true_rad = apparent_rad + bending_rad
         self.last_rad = float(true_rad[-1])
-        self.spline = CubicSpline(true_rad, bending_rad)
+        self.spline = scipy.interpolate.CubicSpline(true_rad, bending_rad)
 
     def bending_rad(self, zenith_rad: Floats) -> Floats:
         """(N,) angles by which sources appear nearer to the zenith, at (N,) zenith distances without air."""

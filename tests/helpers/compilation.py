@@ -7,15 +7,20 @@ most tests need. All steps run once in CI, beside other work: most of what the s
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress, TimeElapsedColumn
 
 from skysim.core.paths import ROOT
 
+POLL_S = 0.5
 Step = Sequence[str]  # words after `python -m`; {folder} is a temporary folder
 TRACKER = "skysim.simulation.compilation"
 FRAME = ("--frames", "1", "--out", "{folder}")
@@ -36,13 +41,14 @@ FURTHER: tuple[tuple[Step, ...], ...] = (
 )
 
 
-def compile_steps(steps: Sequence[Step], folder: Path) -> None:
-    """Run the steps of one process in turn; the output appears only if one fails."""
+def compile_steps(steps: Sequence[Step], folder: Path, advance: Callable[[], None]) -> None:
+    """Run the steps of one process in turn, and advance after each; the output appears only if one fails."""
     for words in steps:
         command = [sys.executable, "-m", *(word.format(folder=folder) for word in words)]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
         if done.returncode:
             raise RuntimeError(f"{' '.join(command)}\n{done.stdout}{done.stderr}")
+        advance()
 
 
 def compile_algorithms() -> None:
@@ -78,14 +84,37 @@ def main(words: Sequence[str]) -> None:
     groups = BASIC
     if "--basic" not in words:
         groups = tuple(basic + further for basic, further in zip(BASIC, FURTHER, strict=True))
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as pool:
+    before = compiled_files()
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        ThreadPoolExecutor() as pool,
+        Progress(
+            *Progress.get_default_columns(),
+            TimeElapsedColumn(),
+            console=Console(stderr=True),
+            disable=not sys.stderr.isatty(),
+        ) as bar,
+    ):
+        task = bar.add_task("", total=sum(map(len, groups)))
         done = []
         for n, steps in enumerate(groups):
             own_folder = Path(folder) / str(n)
             own_folder.mkdir()
-            done.append(pool.submit(compile_steps, steps, own_folder))
+            done.append(
+                pool.submit(compile_steps, steps, own_folder, lambda: bar.advance(task))
+            )
+        while wait(done, POLL_S).not_done:
+            text = f"{compiled_files() - before} functions compiled"
+            bar.update(task, description=text)
         for group in done:
             group.result()
+
+
+def compiled_files() -> int:
+    """Number of functions in numba's cache: one file for each type of their arguments."""
+    cache = os.environ.get("NUMBA_CACHE_DIR")
+    folders = [Path(cache)] if cache else [ROOT / "skysim", ROOT / "estimator"]
+    return sum(1 for folder in folders for _ in folder.rglob("*.nbc"))
 
 
 if __name__ == "__main__":

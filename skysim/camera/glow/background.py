@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 import erfa
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.interpolate import RectBivariateSpline
 from scipy.spatial.transform import Rotation
 from scipy.special import erfc
 
@@ -296,14 +296,16 @@ def zodiacal_glow(config: ZodiacalGlowConfig, view: ViewingGeometry) -> Floats:
 
 
 @lru_cache(maxsize=1)
-def zodiacal_table() -> RectBivariateSpline:
+def zodiacal_table() -> "scipy.interpolate.RectBivariateSpline":
     """The logarithm of zodiacal light in S10 at ecliptic longitudes from the Sun's, 0 to 180 deg, and latitudes.
 
     Source: Leinert et al. 1998, A&AS 127, 1, table 17, to 10 or 20 %. It is blank within 15 deg of the Sun, where the
     light is brighter than here.
     """
     s10 = np.loadtxt(DATA / "zodiacal_light.csv", delimiter=",")
-    return RectBivariateSpline(s10[1:, 0], s10[0, 1:], np.log(s10[1:, 1:]), kx=1, ky=1)
+    return scipy.interpolate.RectBivariateSpline(
+        s10[1:, 0], s10[0, 1:], np.log(s10[1:, 1:]), kx=1, ky=1
+    )
 
 
 # Radiance models by kind. To add one, add a class to scene/sections/surroundings.py and a function here.

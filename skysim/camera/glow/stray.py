@@ -18,8 +18,8 @@ from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
-from scipy import fft, ndimage, special
-from scipy.interpolate import RectBivariateSpline
+import scipy
+from scipy import special
 
 from skysim.camera.glow.background import PointedCamera, unproject
 from skysim.camera.optics import Optics
@@ -78,12 +78,12 @@ def add_glare(light_e: Array, config: GlareConfig) -> None:
     height, width = (size // block for size in light_e.shape)
     coarse = light_e.reshape(height, block, width, block).mean(axis=(1, 3), dtype=float)
     # 2. Product with the transform of g.
-    spectrum = fft.dctn(coarse, type=2, norm="ortho") * transfer(
+    spectrum = scipy.fft.dctn(coarse, type=2, norm="ortho") * transfer(
         config, (height, width), block
     )
-    scattered = fft.idctn(spectrum, type=2, norm="ortho").astype(light_e.dtype)
+    scattered = scipy.fft.idctn(spectrum, type=2, norm="ortho").astype(light_e.dtype)
     # 3. Back to pixels; `share` of the light is scattered.
-    fine = ndimage.zoom(scattered, block, order=1, mode="reflect", grid_mode=True)
+    fine = scipy.ndimage.zoom(scattered, block, order=1, mode="reflect", grid_mode=True)
     light_e *= 1 - config.share
     light_e += config.share * fine
 
@@ -178,7 +178,7 @@ def spread(
     values = np.nan_to_num(diffuse.irradiance_e_s_m2(points_m, normals)).reshape(IRRADIANCE)
     places = (np.linspace(0, 1, count) for count in IRRADIANCE)
     nodes = (np.linspace(0, 1, count) for count in shape)
-    return RectBivariateSpline(*places, values, kx=1, ky=1)(*nodes).ravel()
+    return scipy.interpolate.RectBivariateSpline(*places, values, kx=1, ky=1)(*nodes).ravel()
 
 
 @lru_cache(maxsize=8)

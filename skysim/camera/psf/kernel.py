@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from scipy import fft, special
+from scipy import special
 
 from skysim.camera.optics import Optics
 from skysim.camera.psf.otf import (
@@ -368,15 +368,15 @@ def grid_kernel(model: PsfModel) -> Kernel:
         samples //= 2
     # The transform is periodic: wings need room beyond the image, or they fold back into it.
     with_wings = min(size + 2 * int(np.ceil(model.wing_margin_px())), 3072 // samples)
-    box = fft.next_fast_len(max(size, with_wings), real=True)
+    box = scipy.fft.next_fast_len(max(size, with_wings), real=True)
     # 2. The spectrum, the pixel's included, and its inverse transform.
-    fx = fft.rfftfreq(samples * box, 1 / samples)[None, :]
-    fy = fft.fftfreq(samples * box, 1 / samples)[:, None]
+    fx = scipy.fft.rfftfreq(samples * box, 1 / samples)[None, :]
+    fy = scipy.fft.fftfreq(samples * box, 1 / samples)[:, None]
     softening_px = softening_sigma_px(highest_passed, 0.4 * samples)
     otf = model.otf(fx, fy, softening_px)
     depth = model.camera.detector.intrapixel
     otf = otf * pixel(depth, fx) * pixel(depth, fy)
-    image = fft.irfft2(otf, s=(samples * box,) * 2)
+    image = scipy.fft.irfft2(otf, s=(samples * box,) * 2)
     place = np.arange(size) - half
     position = np.arange(-1, samples + 2)
     # 3. Sub-pixel sample of each pixel and position; the modulo wraps negative indices of the periodic image.

@@ -24,7 +24,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from scipy.optimize import nnls
+import scipy
 
 from skysim.core.constants import STANDARD_GRAVITY_M_S2
 from skysim.core.types import Floats
@@ -187,7 +187,9 @@ class ThrusterActuator(FanSet):
         They minimize |A f - T|^2 + |SHARING A|^2 |f|^2 for the lever arms A, by non-negative least squares (Lawson &
         Hanson 1974). The second term shares the torque among thrusters that act alike.
         """
-        return nnls(self.weighted_m, np.append(torque_nm, np.zeros(len(self.motor))))[0]
+        return scipy.optimize.nnls(
+            self.weighted_m, np.append(torque_nm, np.zeros(len(self.motor)))
+        )[0]
 
     def drive(self, torque_nm: Floats) -> Floats:
         """The thrusts, scaled to the limit by one factor."""

@@ -105,7 +105,7 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         detected = usable(known.take(known.visible & ~breaks), context)
         used = within_gate(detected, context)
         # Those that are left where most streaks break are not fitted as well as expected.
-        most_break = 2 * len(detected) < len(usable(seen, context))
+        most_break = breaks.any() and 2 * len(detected) < len(usable(seen, context))
         fits.append(used.take(used.row < 0) if most_break else used)
         rows.append((exposure, beam, known, seen, used, others))
     columns = map(list, zip(*rows, strict=True))

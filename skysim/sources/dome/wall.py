@@ -5,8 +5,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.integrate import quad
-from scipy.optimize import bisect
+import scipy
 
 from skysim.core.types import Floats
 from skysim.sources.dome.surface import Radial, Shell
@@ -53,11 +52,15 @@ def wall_size(surface: Radial, cap_deg: float) -> WallSize:
         point_m = inner(angle_rad)[0] * unit(angle_rad)
         return -1.0 if rim.contains(point_m)[0] else 1.0
 
-    edge_rad = bisect(beyond, 0.0, math.pi, xtol=1e-13) if beyond(math.pi) > 0 else math.pi
+    edge_rad = (
+        scipy.optimize.bisect(beyond, 0.0, math.pi, xtol=1e-13)
+        if beyond(math.pi) > 0
+        else math.pi
+    )
     # The thickness has a kink at the base.
     kinks = [min(shell.base_rad, edge_rad)]
     area_m2, volume_m3 = (
-        2 * math.pi * quad(density, 0.0, edge_rad, points=kinks)[0]
+        2 * math.pi * scipy.integrate.quad(density, 0.0, edge_rad, points=kinks)[0]
         for density in (area, volume)
     )
     return WallSize(area_m2, volume_m3)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numba
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,9 +10,19 @@ from hypothesis import strategies as some
 
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
+from estimator.core.jit import compiled_s
 from estimator.detection.detect import to_native
 from estimator.trackers import pipeline
 from tests.helpers.laws import law
+
+
+def test_the_time_of_a_stage_is_without_compilation() -> None:
+    numba.njit(lambda x: x - 1)(1)  # loads the compiler
+    before_s = compiled_s()
+    clock = pipeline.Clock()
+    numba.njit(lambda x: x + 1)(1)
+    clock.lap("stage")
+    assert 0 < 4 * clock.seconds["stage"] < compiled_s() - before_s
 
 
 @law(pipeline.loop_type)
