@@ -145,18 +145,21 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
        eigenvalues, and their difference is the variance of an error that is common to all lights.
     """
     # 1. Number
-    field = np.array([0.0, width_px, 0.0, height_px])
-    rows = spread(centroids.xy_px, field, most)
-    if len(rows) < len(centroids):
+    rows = np.arange(len(centroids))
+    if len(rows) > most:
+        field = np.array([0.0, width_px, 0.0, height_px])
+        rows = spread(centroids.xy_px, field, most)
         centroids = centroids.take(rows)
     # 2. Double images
     head = brighter_within(centroids.xy_px, DOUBLE_PX)
-    first, group, members = np.unique(head, return_inverse=True, return_counts=True)
+    members = np.bincount(head)
+    pairs = np.count_nonzero(members == 2)
     by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
-    if 2 * np.sum(members == 2) < len(first) or by_chance > 1 / 8:
+    if 2 * pairs < np.count_nonzero(members) or by_chance > 1 / 8:
         return ChosenLights(centroids, rows, np.zeros(2))
+    first, group = np.unique(head, return_inverse=True)
     sums_px = [np.bincount(group, x) for x in centroids.xy_px.T]
-    mean_px = np.stack(sums_px, axis=1) / members[:, None]
+    mean_px = np.stack(sums_px, axis=1) / members[first, None]
     offset_px = centroids.xy_px - mean_px[group]
     second = np.flatnonzero(head < np.arange(len(head)))
     reach2_px2 = np.zeros(len(first))

@@ -369,8 +369,15 @@ def slopes(x: float, y: float, f: float, d_x: Floats, d_y: Floats) -> None:
         d t_x = f (-x y,      1 + x^2,  -y,  x)
         d t_y = f (-1 - y^2,  x y,       x,  y)
     """
-    d_x[:] = -f * x * y, f * (1 + x * x), -f * y, f * x
-    d_y[:] = -f * (1 + y * y), f * x * y, f * x, f * y
+    # Element by element: slices would make this function too large to be inlined.
+    d_x[0] = -f * x * y
+    d_x[1] = f * (1 + x * x)
+    d_x[2] = -f * y
+    d_x[3] = f * x
+    d_y[0] = -f * (1 + y * y)
+    d_y[1] = f * x * y
+    d_y[2] = f * x
+    d_y[3] = f * y
 
 
 @jit

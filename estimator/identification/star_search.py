@@ -575,16 +575,18 @@ def fit_to_all(
     if not len(candidate.star):
         return build_solution(detections, stars, candidate)
     fitted_to = detections
-    full = no_hypothesis()
+    full = candidate
     # A candidate of some detections is less accurate than the fit to all: the first match has a wider gate.
     gates = gates_of(detections, 1.5)
     R = candidate.R_cam_from_ref
     if calibrated:
-        # 9a. The fit with the calibrated focal length.
+        # 9a. The fit with the calibrated focal length; a candidate with it that all detections match is this fit.
         fitted_to = changed(detections, 1.0, 0.0)
-        full = evaluate(fitted_to, stars, R.copy(), 1.0, gates, -np.inf)
+        if len(candidate.star) < len(gates) or candidate.focal_ratio != 1:
+            full = evaluate(fitted_to, stars, R.copy(), 1.0, gates, -np.inf)
     # If all detections match there is none that another focal length could match.
-    if len(full.star) < len(gates) or focal_gain_dex(detections, stars, full) >= FREE_DEX:
+    whole = calibrated and len(full.star) == len(gates)
+    if not whole or focal_gain_dex(detections, stars, full) >= FREE_DEX:
         # 9b. The fit with a free focal length.
         fitted = evaluate(detections, stars, R.copy(), candidate.focal_ratio, gates, -np.inf)
         if not calibrated or fitted.dex > full.dex + WRONG_FOCAL_DEX:

@@ -639,11 +639,19 @@ class StarTracker(FrameTracker):
         if not len(solution.star):
             return Refit(solution, camera, 1.0)
         # 1. Errors
-        uncertainty = 0.0 if same_focal else star_search.WRONG_FOCAL
-        detections = self.detections(centroids, sigma_px, uncertainty)
         own_px = self.sigma_px(centroids)
         exact = np.array_equal(own_px, sigma_px)
         known = exact and not self.focal_uncertainty
+        settled = known and 0 < variance < misfit.TELLING
+        if (
+            settled
+            and len(solution.star) == len(centroids)
+            and self.settings.centroid_sigma_px
+        ):
+            # Where all centroids match no star just misses one, and the floor of the errors is given.
+            return Refit(solution, camera, variance)
+        uncertainty = 0.0 if same_focal else star_search.WRONG_FOCAL
+        detections = self.detections(centroids, sigma_px, uncertainty)
         if not variance:
             if exact:
                 solution, detections = misfit.with_companions(solution, detections, self.sky)

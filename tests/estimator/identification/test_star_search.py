@@ -150,6 +150,29 @@ def test_true_lights_give_the_true_attitude_and_names() -> None:
         assert len(solution.star) == len(row)
 
 
+def test_a_field_whose_lights_all_match_needs_no_second_fit() -> None:
+    """The search's own fit: another one from there finds the same stars, attitude and evidence."""
+    rng = np.random.default_rng(15)
+    whole = 0
+    for _ in range(30):
+        tangent, mag, _ = observe(Rotation.random(rng=rng), rng)
+        detections = detections_of(tangent, mag)
+        solution = solve(detections)
+        if len(solution.star) < len(mag):
+            continue
+        whole += 1
+        first = Rotation.from_quat(solution.cam_from_ref_xyzw)
+        again = star_evidence.evaluate(
+            detections, SKY, first.as_matrix(), 1.0, gates_of(detections, 1.5), -np.inf
+        )
+        assert np.array_equal(again.observed, solution.observed)
+        assert np.array_equal(again.star, solution.star)
+        turn = Rotation.from_matrix(again.R_cam_from_ref) * first.inv()
+        assert turn.magnitude() < 1e-3 * SIGMA
+        assert again.dex == pytest.approx(solution.dex, abs=1e-3)
+    assert whole > 10
+
+
 @pytest.mark.parametrize("known", [True, False])
 def test_a_field_is_identified_if_half_of_its_lights_are_false(known: bool) -> None:
     rng = np.random.default_rng(3)
