@@ -15,6 +15,7 @@ from tests.helpers.labpage import (
     NARROW,
     Server,
     come,
+    open_scene,
     opened,
     panel,
     pictured,
@@ -75,6 +76,28 @@ def test_a_frame_s_row_counts_its_saturated_pixels() -> None:
     counts = [kept.view.statistics.saturated for kept in playing.frames]
     assert [row.saturated for row in rows] == counts
     assert max(counts) > 0
+
+
+@pytest.mark.browser
+@in_browser
+def test_what_the_filter_refuses_is_on_the_timeline_with_its_reason(
+    browser: Any, server: Server
+) -> None:
+    """A gate of a third of a sigma refuses most of the right attitudes."""
+    with opened(browser, server.login, NARROW) as page:
+        open_scene(page, "simsat_bump")
+        panel(page, "Scene")
+        page.get_by_placeholder("find a key").fill("gate_sigma")
+        set_to(page, "filter.gate_sigma", "0.3")
+        simulate(page, 8)
+        page.get_by_text(re.compile("of 8 frames solved")).first.wait_for()
+        panel(page, "Run")
+        events = page.get_by_role("list", name="Events of the flight").get_by_role("button")
+        told = [one.get_attribute("aria-label") for one in events.all()]
+        refused = [text for text in told if "the filter refused: outside the gate" in text]
+        assert refused
+        assert not any("the filter used" in text for text in told)
+        pictured(page, "timeline_filter")
 
 
 @pytest.mark.browser

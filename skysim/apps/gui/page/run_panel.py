@@ -277,7 +277,8 @@ class RunPanel:
             strips(self.rows, self.log, lights), max(ends, default=1.0), self.page.sensor.name
         )
         frames = [
-            (one.row.t_s, one.row.status, one.row.wrong, one.saturated) for one in self.rows
+            (one.row.t_s, one.row.status, one.row.wrong, one.saturated, one.row.filter)
+            for one in self.rows
         ]
         self.timeline.run_method("show", frames, self.limits, max(ends, default=1.0))
         info = self.page.scene_info
