@@ -56,6 +56,7 @@ class AttitudeCard:
                 LiveText(page.contents).classes("mono ellipsis lab-status").mark("status")
             )
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
+        page.derive(lambda view: view.image, self.empty)
 
     def angle_input(self, n: int) -> LiveInput:
         return (
@@ -91,6 +92,13 @@ class AttitudeCard:
     def focus(self) -> None:
         """Give the first angle the keyboard focus."""
         self.inputs[0].run_method("focus")
+
+    def empty(self) -> None:
+        """Show no attitude."""
+        for field in self.inputs:
+            field.set_value("")
+        for label in (*self.estimates, *self.errors, self.status):
+            label.set_text("")
 
     def show(self, image: FrameView | Photo, of: SceneInfo | Photo) -> None:
         """Display the attitudes of a frame of a scene or of another image; a user's image has no true attitude."""
