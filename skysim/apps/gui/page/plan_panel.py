@@ -33,7 +33,6 @@ ALIKE = 0.9  # fraction of coinciding LEDs from which a tracker without a prior 
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
 COVERAGE = "Coverage"
-UNCOVERED = f"{COVERAGE} solves a frame at each of many attitudes in reach; a click on the map moves the camera there."
 COLORED = "In the 3-D view the LEDs are the brighter the better they are measured."
 UNPLANNED = (
     "Plan begins a survey: it chooses the attitudes from which the dome's LEDs are measured best. Fly takes frames at"
@@ -80,7 +79,7 @@ class CheckPanel:
             with column:
                 widgets.quiet(text)
         self.stop()
-        self.coverage.run_method("begin", [], False, UNCOVERED)
+        self.coverage.run_method("begin", [], False)
 
     def stop(self) -> None:
         """Compute no further attitude of the map of coverage."""
@@ -99,7 +98,7 @@ class CheckPanel:
         if self.covering is not own or info is None:
             return
         self.angles_deg, boresights = reach or ([], [])
-        self.coverage.run_method("begin", boresights, info.scene.stars is not None, "")
+        self.coverage.run_method("begin", boresights, info.scene.stars is not None)
         for angles_deg in self.angles_deg:
             found = await self.page.ask("cover", angles_deg)
             if found is None or self.covering is not own:

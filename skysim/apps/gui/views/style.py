@@ -135,7 +135,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-coverage .ring circle {{ fill: none; stroke: {COLORS["line"]} }}
 .lab-coverage .ring text {{ fill: {COLORS["quiet"]}; font-size: 9px }}
 .lab-coverage .legend {{ display: flex; flex-wrap: wrap; gap: 2px 12px; align-items: center }}
-.lab-coverage .legend svg {{ width: 16px; vertical-align: -3px; margin-right: 4px }}
+.lab-coverage .legend svg {{ display: inline; width: 16px; vertical-align: -3px; margin-right: 4px }}
 .lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
@@ -150,7 +150,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
-.lab-lights {{ font-size: 11px }} .lab-lights th {{ white-space: normal }}
+.lab-lights.mono {{ font-size: 11px }} .lab-lights th {{ white-space: normal }}
 .lab-lights tr > * {{ padding-left: 5px }} .lab-lights tr > :is(:first-child, :last-child) {{ width: 17%; max-width: 0;
   overflow: hidden; text-overflow: ellipsis }}
 .lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}

@@ -7,6 +7,7 @@ const STATES = {
   refused: { color: "warn", path: `M-${MARK} -${MARK}H${MARK}V${MARK}H-${MARK}Z` },
   wrong: { color: "bad", path: `M0 -${MARK + 4}L${MARK + 3} ${MARK}H-${MARK + 3}Z` },
 };
+const EMPTY = "Coverage solves a frame at each of many attitudes in reach; a click on the map moves the camera there.";
 const RINGS_DEG = [2, 5, 10, 15, 30, 45, 60];
 const polar = ([x, y, z]) => Math.acos(Math.max(-1, Math.min(1, z / Math.hypot(x, y, z))));
 
@@ -24,7 +25,7 @@ export default {
       <p v-if="total" class="legend"><span v-for="one in legend"><svg viewBox="-16 -16 32 32"><path :d="one.path"
         :style="one.style"></path></svg>{{ one.name }} {{ one.count }}</span></p>
     </div>`,
-  data: () => ({ text: "", total: 0, rings: [], marks: [], places: [] }),
+  data: () => ({ text: EMPTY, total: 0, rings: [], marks: [], places: [] }),
   computed: {
     box: () => `${-R - 16} ${-R - 18} ${2 * R + 32} ${2 * R + 36}`,
     legend() {
@@ -36,8 +37,8 @@ export default {
       const { color, path } = STATES[name], css = `var(--lab-${color})`;
       return { path, style: { stroke: css, fill: css } };
     },
-    // A new map. directions: of the boresights, z in the middle of the map;  text: what is shown instead of an empty one
-    begin(directions, isSky, text) {
+    // A new map, or none. directions: of the boresights, z in the middle of the map
+    begin(directions, isSky) {
       const most = Math.max(...directions.map(polar), 0.02), degree = Math.PI / 180;
       const step = RINGS_DEG.find((ring) => most / degree / ring < 4.5) ?? 60;
       const labels = Array.from({ length: Math.floor(most / degree / step + 1e-6) }, (_, n) => (n + 1) * step);
@@ -48,7 +49,8 @@ export default {
       });
       this.directions = directions;
       this.view = isSky ? "North is in the middle, RA 0° on the right." : "As seen from above, the lab's x axis to the right.";
-      Object.assign(this, { marks: [], total: directions.length, text: text || `0 of ${directions.length} attitudes` });
+      const text = directions.length ? `0 of ${directions.length} attitudes` : EMPTY;
+      Object.assign(this, { marks: [], total: directions.length, text });
       this.draw();
     },
     // The next attitude: its angles, the counts of lights in the field, detected and identified, the tracker's status, and
