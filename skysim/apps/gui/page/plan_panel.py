@@ -11,7 +11,7 @@ import numpy as np
 from nicegui import ui
 from scipy.spatial.transform import Rotation
 
-from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan, Triple
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import context, forms, space, style, widgets
 from skysim.core.types import Floats, Ints
@@ -56,6 +56,7 @@ class CheckPanel:
     """
 
     covering: object | None = None
+    angles_deg: Sequence[Triple] = ()
 
     def __init__(self, page: context.PageContext, scene_3d: space.Scene3D) -> None:
         self.page = page
