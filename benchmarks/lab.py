@@ -3,7 +3,7 @@
 `python -m benchmarks lab` serves shefex2 with a detector of 1024 x 1024 pixels and 120 frames at 40 Hz; every frame is
 solved. A browser without a graphics card draws on the same cores that render the frames, so the processor time of
 server and browser is measured too: it depends less on what else the machine does. `SKYSIM_BENCH_TABS` is the number of
-tabs that are opened and closed for the memory, 20 by default, and `SKYSIM_BENCH_PLAY_S` the time of playing, 120 s.
+tabs that are opened and closed for the memory, 30 by default, and `SKYSIM_BENCH_PLAY_S` the time of playing, 120 s.
 
 The tabs share a browser's cache, as a person's do. Those of the crowd are in another browser of the lowest priority,
 since people have their own computers.
@@ -47,11 +47,12 @@ FLAGS = ("--no-sandbox", "--enable-unsafe-swiftshader")
 TOKEN = "bench"
 WORKERS_LIMIT = 4
 HELD_S = 6.0
+REPEAT_S = 0.03  # a keyboard's repeat interval
 PRESSES = 30
 CROWD = 20
 # the first load code
 WARM_TABS = 3
-TABS = int(os.environ.get("SKYSIM_BENCH_TABS", "20"))
+TABS = int(os.environ.get("SKYSIM_BENCH_TABS", "30"))
 PLAY_S = float(os.environ.get("SKYSIM_BENCH_PLAY_S", "120"))
 LOOK_S = 2.0
 COLLECTED_S = 2 * QUIET_S  # until a closed page is collected
@@ -252,17 +253,22 @@ def speed(tabs: Any, server: Server, size: tuple[int, int]) -> list[dict[str, An
     page.evaluate(WATCH)
     held = measured(page, server, traffic, partial(hold, page))
     page.wait_for_timeout(500)
+    before = (server.cpu_s(), browser_cpu_s())
     delays = delays_ms(page, PRESSES)
+    after = (server.cpu_s(), browser_cpu_s())
+    spent_ms = [1e3 * (b - a) / PRESSES for a, b in zip(before, after, strict=True)]
     simulate(page)
     played = measured(page, server, traffic, partial(play, page))
     page.close()
     middle, most = np.quantile(delays, [0.5, 0.9])
     return [
-        verdict(f"page opened and shown, {screen}", open_s, "s", "a worker is ready", 3.0),
+        verdict(f"page opened and shown, {screen}", open_s, "s", "a worker is ready", 2.0),
         verdict(
-            f"key to picture, median, {screen}", middle, "ms", f"{PRESSES} presses", 60.0
+            f"key to picture, median, {screen}", middle, "ms", f"{PRESSES} presses", 50.0
         ),
         verdict(f"key to picture, 90 %, {screen}", most, "ms", f"{PRESSES} presses", 90.0),
+        plain(f"key: processor, server, {screen}", spent_ms[0], "ms/key", "with its worker"),
+        plain(f"key: processor, browser, {screen}", spent_ms[1], "ms/key", "and at rest"),
         *held.rows(f"key held, {screen}"),
         *played.rows(f"playing, {screen}"),
     ]
@@ -345,11 +351,11 @@ def measured(
 
 
 def hold(page: Any) -> None:
-    """Hold an arrow key."""
-    end = time.monotonic() + HELD_S
-    while time.monotonic() < end:
+    """Hold an arrow key. The driver takes some 13 ms for a press, so the presses follow a schedule."""
+    begin = time.monotonic()
+    for count in range(1, round(HELD_S / REPEAT_S) + 1):
         page.keyboard.down("ArrowLeft")
-        time.sleep(0.03)  # a keyboard's repeat interval
+        time.sleep(max(begin + count * REPEAT_S - time.monotonic(), 0.0))
     page.keyboard.up("ArrowLeft")
 
 
@@ -415,13 +421,12 @@ def playing(tabs: Any, server: Server) -> dict[str, Any]:
 
 
 def growth(name: str, levels: list[float]) -> dict[str, Any]:
-    """Growth between the medians of either half of some levels of memory, MB."""
+    """Change between the medians of either half of some levels of memory, MB."""
     half = len(levels) // 2
     before = float(np.median(levels[:half]))
     after = float(np.median(levels[half:]))
-    return verdict(
-        name, 100 * (after - before) / before, "%", f"{before:.0f} to {after:.0f} MB", 2.0
-    )
+    change = 100 * (after - before) / before
+    return verdict(name, abs(change), "%", f"{before:.1f} to {after:.1f} MB", 2.0)
 
 
 def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
@@ -455,7 +460,7 @@ def crowd(tabs: Any, other: Any, server: Server) -> list[dict[str, Any]]:
         verdict(
             "a waiting tab opened after a worker is free", waited_s, "s", f"{CROWD} tabs", 5.0
         ),
-        verdict("greatest delay of a key while they open", worst - median, "ms", what, 200.0),
+        verdict("greatest delay of a key while they open", worst - median, "ms", what, 150.0),
     ]
 
 

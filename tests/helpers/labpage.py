@@ -220,7 +220,7 @@ def source(page: Any) -> str:
 def changed(page: Any, before: str) -> None:
     """Wait for another frame."""
     page.wait_for_function(
-        "before => document.querySelector('.lab-frame canvas').dataset.frame !== before",
+        "before => ![undefined, before].includes(document.querySelector('.lab-frame canvas').dataset.frame)",
         arg=before,
     )
 

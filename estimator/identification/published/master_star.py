@@ -34,6 +34,8 @@ from estimator.identification.direct_match import (
 )
 from estimator.identification.solver_options import Options
 
+SECONDS = 4  # greatest number of second stars that are tried with a candidate
+
 
 class MasterStarOptions(NamedTuple):
     """Search parameters.
@@ -193,7 +195,8 @@ def _best_match(
     """The better of `best` and the direct matches at the attitudes from the master and a second star: step 3.
 
     The second star is the farthest from the master, for its leverage, and each of the next three, in case it is
-    false or not in the catalog.
+    false. Lights at an angle that the candidate does not have are not tried, since more than three false lights may be
+    farther, as with hot pixels.
 
     Parameters
     ----------
@@ -208,11 +211,15 @@ def _best_match(
     """
     sides = np.array([angle(rays[0], rays[n]) for n in range(len(rays))])
     # Stars at the angle of the second star from the candidate.
-    for n in np.argsort(-sides)[: min(4, len(rays) - 1)]:
+    seconds = 0
+    for n in np.argsort(-sides)[:-1]:
         tolerance = sqrt(2.0) * options.tolerance_rad + options.stretch * sides[n]
         begin, end = neighbor_range(
             index, candidate, sides[n] - tolerance, sides[n] + tolerance
         )
+        seconds += end > begin
+        if seconds > SECONDS:
+            break
         for second in index.neighbor[begin:end]:
             stars = np.array([candidate, second], np.int64)
             tried[0] += 1

@@ -73,10 +73,18 @@ NO_PIXELS = Pixels(b"", {}, ALL_PIXELS, 0)
 
 
 # The true lights of a frame, as rows of an array, since objects for hundreds of stars take longer to send than the
-# pixels: HIP or LED number, pixel (x, y), electrons, V magnitude (NaN of an LED).
+# pixels: HIP or LED number, pixel (x, y), electrons, V magnitude (NaN of an LED), expected electrons in its brightest
+# pixel, and whether that is expected to be saturated.
 Lights = Any  # numpy's types do not know that parts of a recarray are recarrays
 LIGHT = np.dtype(
-    [("id", np.int64), ("xy_px", float, 2), ("electrons", float), ("magnitude", float)]
+    [
+        ("id", np.int64),
+        ("xy_px", float, 2),
+        ("electrons", float),
+        ("magnitude", float),
+        ("peak_e", float),
+        ("saturated", bool),
+    ]
 )
 NO_LIGHTS: Lights = np.recarray(0, LIGHT)
 

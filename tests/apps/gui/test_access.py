@@ -143,7 +143,14 @@ def test_marks_and_states_differ_by_shape_or_text_as_well_as_by_color() -> None:
     assert ".lab-sections .given { font-weight: 600 }" in style.CSS
     # Of the table's rows, the last cell tells the state.
     lights = np.rec.fromarrays(
-        [[1, 2, 3], np.array([(10.0, 10), (50, 50), (90, 90)]), [9e3, 8e3, 7e3], [1.0, 2, 3]],
+        [
+            [1, 2, 3],
+            np.array([(10.0, 10), (50, 50), (90, 90)]),
+            [9e3, 8e3, 7e3],
+            [1.0, 2, 3],
+            [9e2, 8e2, 7e2],
+            [False] * 3,
+        ],
         LIGHT,
     )
     spots = [
@@ -155,8 +162,8 @@ def test_marks_and_states_differ_by_shape_or_text_as_well_as_by_color() -> None:
     assert [(row["state"], row["cells"][0], row["cells"][-1]) for row in table] == [
         ("good", "1", "1"),
         ("warn", "2", "7"),
-        ("quiet", "3", ""),
-        ("warn", "no light", ""),
+        ("quiet", "3", None),
+        ("warn", "no light", None),
     ]
 
 

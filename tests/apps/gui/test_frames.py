@@ -421,11 +421,13 @@ def test_lights_are_a_sequence_that_is_sent_as_columns() -> None:
             random.uniform(0, 1000, (count, 2)),
             random.random(count),
             random.random(count),
+            random.random(count),
+            random.random(count) > 0.5,
         ],
         LIGHT,
     )
     again = pickle.loads(pickle.dumps(lights))
-    assert len(pickle.dumps(lights)) < 41 * count + 1000  # eight bytes a number
+    assert len(pickle.dumps(lights)) < 50 * count + 1000  # eight bytes a number
     assert len(again) == count
     assert again[3] == lights[3]
     assert [light.id for light in again[5:8]] == [5, 6, 7]

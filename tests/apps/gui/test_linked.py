@@ -49,6 +49,8 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
             places_px,
             np.array([5000.0, 900, 100]),
             np.array([1.5, np.nan, 4]),
+            np.array([1250.0, 90, 9]),
+            np.array([True, False, False]),
         ],
         LIGHT,
     )
@@ -57,13 +59,21 @@ def test_the_table_has_every_light_with_its_detection_then_the_false_ones() -> N
         Detection(10.3, 20.4, 0.05, 700, 3, (0.02, 0.0)),
         Detection(40.0, 50.0, 0.1, 90, 9, (0.3, 0.4)),
     ]
-    table = list(readouts.rows(true, found, "LED {}".format))
+    table = list(readouts.rows(true, found, "LED {}".format, 1000.0))
     assert [row["id"] for row in table] == [3, 4, 5, -1]
     assert [row["state"] for row in table] == ["good", "warn", "quiet", "warn"]
-    assert table[0]["cells"] == ["LED 3", "1.50", "5000", "10.00", "20.00", "0.500", "LED 3"]
+    assert table[0]["cells"] == [
+        *("LED 3", 1.5, 5000.0, 1250.0, "full", 10.0, 20.0),
+        *(pytest.approx(0.5), "LED 3"),
+    ]
+    assert table[1]["cells"][3:5] == [90.0, 0.09]
+    unknown = list(readouts.rows(true, found, "LED {}".format))
+    assert unknown[0]["cells"][4] == "full"
+    assert np.isnan(unknown[1]["cells"][4])  # null in the browser
     assert table[1]["cells"][-1] == "LED 9"
-    assert table[1]["cells"][1] == ""  # an LED has no magnitude
-    assert table[3]["cells"][:5] == ["no light", "", "50", "200.00", "200.00"]
+    assert np.isnan(table[1]["cells"][1])  # an LED has no magnitude
+    assert table[3]["cells"][:7] == ["no light", None, 50, None, None, 200, 200]
+    assert {len(row["cells"]) for row in table} == {9}
     assert len({row["key"] for row in table}) == 4
 
 

@@ -326,6 +326,8 @@ LIGHTS = np.rec.fromarrays(
         np.array([[10.0, 20], [50, 60]]),
         np.array([1e4, 1e3]),
         np.array([2.0, 4.0]),
+        np.array([1e3, 1e2]),
+        np.array([False, False]),
     ],
     LIGHT,
 )

@@ -31,6 +31,7 @@ from skysim.dynamics import guidance
 from skysim.experiments.dome_survey import survey_frames
 from skysim.scene import loader
 from skysim.simulation import checks
+from skysim.simulation.checks import attitudes, detection, sampling
 from skysim.simulation.lab import build_lab
 from skysim.tracking import dome_map_file
 from tests.helpers.labpage import (
@@ -283,6 +284,61 @@ def test_colors_differ_in_lightness() -> None:
     """The scale's luminance is monotonic, so that color-blind readers can read it."""
     luminance = color_scale(np.linspace(0, 1, 64)) @ [0.2126, 0.7152, 0.0722]
     assert np.all(np.diff(luminance) > 0)
+
+
+@pytest.mark.slow
+def test_coverage_is_that_of_the_checked_attitudes_and_leaves_the_frame() -> None:
+    """An independent count: lights of the check's own forecast at the same attitude."""
+    worker = Worker()
+    _, before = worker.open("afit_simsat", {}, True)
+    angles, boresights = worker.reach()
+    lab = worker.workbench.lab
+    reach = attitudes.within_reach(attitudes.of_frames(lab), 0.999 * 30.0)
+    np.testing.assert_allclose(boresights, reach.boresights, rtol=0, atol=1e-12)
+    forecast = sampling.sampled(reach, detection.context_of(lab))
+    for n in (0, 17, 40):
+        lights, row = worker.cover(angles[n])
+        np.testing.assert_allclose(row.truth_deg, angles[n], rtol=0, atol=1e-9)
+        # The images of some are only in part on the detector.
+        assert 0 <= lights - len(forecast.seen[n]) <= 4
+        assert row.detected <= lights
+        assert (row.status == "solved") == (row.matched > 0)
+    assert worker.export()["frame.fits"]
+    assert worker.workbench.result is before.result
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_a_map_of_coverage_can_be_stopped_and_a_click_points_the_camera(page: Any) -> None:
+    open_scene(page, "afit_simsat")
+    panel(page, "Check")
+    page.get_by_role("button", name="Coverage", exact=True).click()
+    marks = page.locator(".lab-coverage [role=button]")
+    assert come(lambda: marks.count() >= 3)
+    page.get_by_role("button", name="Stop", exact=True).click()
+    page.get_by_role("button", name="Coverage", exact=True).wait_for()
+    count = marks.count()
+    page.wait_for_timeout(1000)
+    assert marks.count() == count < 48
+    page.get_by_role("button", name="Coverage", exact=True).click()
+    assert come(lambda: marks.count() == 48)
+    page.get_by_text("48 of 48 attitudes").wait_for()
+    told = marks.nth(30).get_attribute("aria-label")
+    marks.nth(30).click()
+    wanted = [float(text) for text in re.findall(r"(-?[\d.]+)°", told)]
+    assert come(
+        lambda: np.allclose(
+            [float(field.input_value()) for field in page.locator(".lab-angle").all()],
+            wanted,
+            rtol=0,
+            atol=0.051,
+        )
+    )
+    assert "solved" in told
+    space = page.locator(".lab-space canvas").first
+    assert space.get_attribute("data-dots") == "48"
+    open_scene(page, "shefex2")
+    assert come(lambda: marks.count() == 0)
 
 
 @pytest.mark.browser

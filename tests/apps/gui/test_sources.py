@@ -21,11 +21,13 @@ from tests.helpers.labpage import (
     NARROW,
     SLOW_MS,
     Server,
+    angles,
     come,
     onto_the_page,
     open_scene,
     opened,
     panel,
+    pictured,
     status,
 )
 
@@ -137,6 +139,37 @@ def test_a_refused_photograph_is_not_beside_lights_of_the_scene(
     page.keyboard.press("1")
     page.get_by_text("No image on the page").wait_for()
     assert come(lambda: not space.get_attribute("data-lights").startswith("identified 0,"))
+
+
+@pytest.mark.browser
+@in_browser
+def test_a_photograph_that_cannot_be_decoded_leaves_no_image(
+    page: Any, tmp_path: Path
+) -> None:
+    before = angles(page)
+    broken = tmp_path / "broken.png"
+    broken.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(100))
+    panel(page, "Lights")
+    rows = page.locator(".lab-lights:visible tbody tr")
+    assert come(lambda: rows.count() > 5)
+    panel(page, "Image")
+    page.set_input_files("input[type=file]", broken)
+    page.locator(".lab-wait", has_text="broken.png: cannot be decoded").wait_for()
+    canvas = page.locator(".lab-frame canvas")
+    assert canvas.get_attribute("data-frame") is None
+    assert canvas.evaluate("canvas => canvas.width") == 0
+    assert page.locator(".lab-banner").inner_text() == "image broken.png"
+    assert [field.input_value() for field in page.locator(".lab-angle").all()] == [""] * 3
+    page.get_by_role("button", name="Export").click()
+    page.locator(".q-menu .q-item", has_text=re.compile("^truth$")).click()
+    page.get_by_role("status").filter(has_text="the page shows no image").wait_for()
+    pictured(page, "no_image")
+    panel(page, "Lights")
+    assert come(lambda: rows.count() == 0)
+    page.get_by_role("button", name="Live", exact=True).click()
+    canvas.and_(page.locator("[data-frame]")).wait_for()
+    assert come(lambda: np.array_equal(angles(page), before))
+    assert page.locator(".lab-wait").is_hidden()
 
 
 @pytest.mark.browser

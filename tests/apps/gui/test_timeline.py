@@ -15,6 +15,7 @@ from tests.helpers.labpage import (
     NARROW,
     Server,
     come,
+    open_scene,
     opened,
     panel,
     pictured,
@@ -75,6 +76,30 @@ def test_a_frame_s_row_counts_its_saturated_pixels() -> None:
     counts = [kept.view.statistics.saturated for kept in playing.frames]
     assert [row.saturated for row in rows] == counts
     assert max(counts) > 0
+
+
+@pytest.mark.browser
+@in_browser
+def test_what_the_filter_refuses_is_on_the_timeline_with_its_reason(
+    browser: Any, server: Server
+) -> None:
+    """A gate of a hundredth of a sigma refuses right attitudes, until three agree and the filter adopts them."""
+    with opened(browser, server.login, NARROW) as page:
+        open_scene(page, "simsat_bump")
+        panel(page, "Scene")
+        page.get_by_placeholder("find a key").fill("gate_sigma")
+        set_to(page, "filter.gate_sigma", "0.01")
+        simulate(page, 4)
+        page.get_by_text(re.compile("of 4 frames solved")).first.wait_for()
+        panel(page, "Run")
+        events = page.get_by_role("list", name="Events of the flight").get_by_role("button")
+        assert come(lambda: events.count() == 3)
+        assert [one.get_attribute("aria-label") for one in events.all()] == [
+            "0.51 s: the filter refused: outside the gate",
+            "1.01 s: the filter refused: outside the gate",
+            "1.51 s: the filter reset",
+        ]
+        pictured(page, "timeline_filter")
 
 
 @pytest.mark.browser

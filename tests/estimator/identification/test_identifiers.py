@@ -175,6 +175,27 @@ def test_false_stars_do_not_prevent_identification(
     assert found >= 19
 
 
+@pytest.mark.parametrize("name", named("master_star"))
+def test_faint_false_lights_in_all_corners_do_not_prevent_identification(
+    sky: pair_index.PairIndex, name: str
+) -> None:
+    """They are the farthest from the master, wherever it is, as the hot pixels of a long or noiseless exposure are."""
+    rng = np.random.default_rng(98)
+    found = 0
+    for one in fields(sky, 20, 99, least=12):
+        corner = np.repeat([[1, 1], [1, -1], [-1, 1], [-1, -1]], 5, axis=0)
+        tangents = corner * rng.uniform(0.9 * HALF_TAN, HALF_TAN, (20, 2))
+        hot = normalized(np.column_stack([tangents, np.ones(20)]))
+        one.seen = np.vstack([one.seen, hot])
+        one.light = np.append(one.light, np.full(20, 9.0))
+        match = identify(name, one, sky)
+        if match is not None:
+            assert match.observed.max() < len(one.row)
+            np.testing.assert_array_equal(match.star, one.row[match.observed])
+            found += 1
+    assert found >= 15
+
+
 @pytest.mark.parametrize("name", PAPERS)
 def test_without_magnitudes_geometry_is_enough(sky: pair_index.PairIndex, name: str) -> None:
     found = 0

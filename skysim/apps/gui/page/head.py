@@ -12,8 +12,8 @@ from skysim.apps.gui.worker import photo
 from skysim.core.paths import SCENES, shipped_files, title_of
 
 NOISE = (
-    "off: every pixel has its expected value. The tracker's threshold falls with the scatter, so faint lights are"
-    " detected and merge with brighter ones."
+    "off: every pixel has its expected value. The tracker's threshold falls with the scatter, so faint lights and"
+    " hot pixels are detected, and lights merge with brighter ones."
 )
 # Of many files, in which every page that opens would search for 13 ms.
 shipped_title = cache(title_of)
@@ -133,6 +133,9 @@ class Head:
         item
             Entry of the menu, a key of FILE_BY_ITEM
         """
+        if not self.page.sensor.has_image:
+            self.page.show_message("nothing to export: the page shows no image")
+            return
         files = await self.page.run_task("export")
         if not files:
             return

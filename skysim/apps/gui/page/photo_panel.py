@@ -92,16 +92,21 @@ class PhotoPanel:
             self.page.show_message(f"{name}: larger than 64 MB")
             return
         self.page.stop_playback()
-        self.show_text(f"solving {name} …", "quiet")
+        self.page.set_state(kind="photo", photo=name)
+        solving = f"solving {name} …"
+        self.show_text(solving, "quiet")
+        self.page.sensor.show_waiting(solving, in_vain=True)
         photo = await self.page.run_task(
             "solve_file",
             name,
             data,
             self.fov.value,
             self.stages,
-            activity=f"solving {name} …",
+            activity=solving,
         )
         self.show(name, photo)
+        if photo is None:
+            self.page.sensor.show_waiting(self.page.message_text, in_vain=True)
 
     @property
     def stages(self) -> Stages:

@@ -11,7 +11,7 @@ import numpy as np
 from nicegui import ui
 from scipy.spatial.transform import Rotation
 
-from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan
+from skysim.apps.gui.messages import AmbiguityMap, SurveyFound, SurveyPlan, Triple
 from skysim.apps.gui.page.run_panel import RunPanel
 from skysim.apps.gui.views import context, forms, space, style, widgets
 from skysim.core.types import Floats, Ints
@@ -32,6 +32,7 @@ FRAMES = 20  # initial number of frames of a survey
 ALIKE = 0.9  # fraction of coinciding LEDs from which a tracker without a prior refuses a field as ambiguous
 UNCHECKED = "Check computes what this scene will show and how accurate its tracker will be. Nothing is rendered."
 UNMAPPED = "Map compares the fields of the dome with one another: a field that looks like another one is ambiguous."
+COVERAGE = "Coverage"
 COLORED = "In the 3-D view the LEDs are the brighter the better they are measured."
 UNPLANNED = (
     "Plan begins a survey: it chooses the attitudes from which the dome's LEDs are measured best. Fly takes frames at"
@@ -39,8 +40,23 @@ UNPLANNED = (
 )
 
 
+class CoverageMap(ui.element, component="js/coverage.js"):  # type: ignore[call-arg]
+    """What the tracker makes of frames at many attitudes, implemented in coverage.js."""
+
+
 class CheckPanel:
-    """Panel with two parts, each computed on request and emptied when the scene changes."""
+    """Panel with three parts, each computed on request and emptied when the scene changes.
+
+    Attributes
+    ----------
+    covering
+        Token of the map of coverage that is being computed; None if there is none
+    angles_deg
+        Attitudes of this map
+    """
+
+    covering: object | None = None
+    angles_deg: Sequence[Triple] = ()
 
     def __init__(self, page: context.PageContext, scene_3d: space.Scene3D) -> None:
         self.page = page
@@ -51,6 +67,9 @@ class CheckPanel:
         with widgets.row().style("margin-top: 8px"):
             widgets.button("Map", self.map, "map")
         self.fields = ui.column().classes("w-full gap-1").mark("map-result")
+        with widgets.row().style("margin-top: 8px"):
+            self.cover_button = widgets.button(COVERAGE, self.cover, "cover")
+        self.coverage = CoverageMap().on("point", self.point).mark("coverage")
         self.empty()
         page.derive(lambda view: view.opened, self.empty)
 
@@ -60,6 +79,41 @@ class CheckPanel:
             column.clear()
             with column:
                 widgets.quiet(text)
+        self.stop()
+        self.coverage.run_method("begin", [], False)
+
+    def stop(self) -> None:
+        """Compute no further attitude of the map of coverage."""
+        self.covering = None
+        self.cover_button.set_text(COVERAGE)
+
+    async def cover(self) -> None:
+        """Solve a frame at each attitude in reach, or stop that. Keys are served between two frames."""
+        if self.covering:
+            self.stop()
+            return
+        own = self.covering = object()
+        self.cover_button.set_text("Stop")
+        reach = await self.page.ask("reach")
+        info = self.page.scene_info
+        if self.covering is not own or info is None:
+            return
+        self.angles_deg, boresights = reach or ([], [])
+        self.coverage.run_method("begin", boresights, info.scene.stars is not None)
+        for angles_deg in self.angles_deg:
+            found = await self.page.ask("cover", angles_deg)
+            if found is None or self.covering is not own:
+                break
+            lights, row = found
+            counts = lights, row.detected, row.matched
+            self.coverage.run_method("add", angles_deg, *counts, row.status, row.wrong)
+        if self.covering is own:
+            self.stop()
+
+    async def point(self, event: Any) -> None:
+        """Show the frame at an attitude of the map."""
+        self.page.stop_playback()
+        await self.page.show_live("point", self.angles_deg[int(event.args)])
 
     async def check(self) -> None:
         found: Check | None = await self.page.run_task(

@@ -56,6 +56,7 @@ class AttitudeCard:
                 LiveText(page.contents).classes("mono ellipsis lab-status").mark("status")
             )
             self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
+        page.derive(lambda view: view.image, self.empty)
 
     def angle_input(self, n: int) -> LiveInput:
         return (
@@ -91,6 +92,13 @@ class AttitudeCard:
     def focus(self) -> None:
         """Give the first angle the keyboard focus."""
         self.inputs[0].run_method("focus")
+
+    def empty(self) -> None:
+        """Show no attitude."""
+        for field in self.inputs:
+            field.set_value("")
+        for label in (*self.estimates, *self.errors, self.status):
+            label.set_text("")
 
     def show(self, image: FrameView | Photo, of: SceneInfo | Photo) -> None:
         """Display the attitudes of a frame of a scene or of another image; a user's image has no true attitude."""
@@ -151,7 +159,6 @@ def status_line(result: TrackerResult | None) -> tuple[str, str]:
 # Lights panel: a table of the true lights of the frame with their detections and matches.
 
 
-HEADS = ("light", "V", "e⁻", "x, px", "y, px", "error, px", "taken for")
 UPDATE_S = 0.5
 
 
@@ -180,59 +187,51 @@ class LightsPanel:
             return
         self.sent = sensor.sent_number
         detections = sensor.result.detections if sensor.result else ()
-        self.table.run_method(
-            "show",
-            HEADS,
-            list(rows(sensor.lights[: overlay.MAX_TRUTH_MARKS], detections, sensor.name)),
-        )
+        full_well_e = sensor.well[2] if sensor.well else math.nan
+        lights = sensor.lights[: overlay.MAX_TRUTH_MARKS]
+        found = rows(lights, detections, sensor.name, full_well_e)
+        self.table.run_method("show", list(found))
 
 
 def rows(
-    lights: Lights, detections: Collection[Detection], name: LightName
+    lights: Lights,
+    detections: Collection[Detection],
+    name: LightName,
+    full_well_e: float = math.nan,
 ) -> Iterator[Record]:
     """Rows of the table: true lights with their detections, brightest first, then detections of no light.
+
+    Parameters
+    ----------
+    full_well_e
+        Electrons of a full well; NaN if it is not known
 
     Returns
     -------
     state
         `good` if the light was identified, `warn` if a detection is false or matched with another
         light, else `quiet`
+    cells
+        Values of the columns in lights.js
     """
     found = list(detections)
     found_px = places_px(found)
     left = dict(enumerate(found))
     for light in lights:
         distance_px = np.hypot(*(found_px - light.xy_px).T)
-        is_near = distance_px.min(initial=np.inf) < overlay.NEAR_PX
+        error_px = distance_px.min(initial=np.inf)
+        is_near = error_px < overlay.NEAR_PX
         spot = left.pop(int(distance_px.argmin()), None) if is_near else None
-        yield {
-            "key": f"light {light.id}",
-            "id": light.id,
-            "state": state(light, spot),
-            "cells": cells(light, spot, name),
-        }
+        last = [error_px, name(spot.id) if spot.id >= 0 else "–"] if spot else [None, None]
+        share = "full" if light.saturated else light.peak_e / full_well_e
+        charge = light.electrons, light.peak_e, share
+        cells = [name(light.id), light.magnitude, *charge, *light.xy_px, *last]
+        row = {"key": f"light {light.id}", "id": light.id, "state": state(light, spot)}
+        yield row | {"cells": cells}
     for n, spot in left.items():
-        taken = name(spot.id) if spot.id >= 0 else ""
-        texts = [
-            "no light",
-            "",
-            f"{spot.flux:.4g}",
-            f"{spot.x:.2f}",
-            f"{spot.y:.2f}",
-            "",
-            taken,
-        ]
-        yield {"key": f"detection {n}", "id": -1, "state": "warn", "cells": texts}
-
-
-def cells(light: Any, spot: Detection | None, name: LightName) -> list[str]:
-    magnitude = "" if math.isnan(light.magnitude) else f"{light.magnitude:.2f}"
-    x, y = light.xy_px
-    texts = [name(light.id), magnitude, f"{light.electrons:.4g}", f"{x:.2f}", f"{y:.2f}"]
-    if spot is None:
-        return [*texts, "", ""]
-    error_px = math.hypot(spot.x - x, spot.y - y)
-    return [*texts, f"{error_px:.3f}", name(spot.id) if spot.id >= 0 else "–"]
+        taken = name(spot.id) if spot.id >= 0 else None
+        cells = ["no light", None, spot.flux, None, None, spot.x, spot.y, None, taken]
+        yield {"key": f"detection {n}", "id": -1, "state": "warn", "cells": cells}
 
 
 def state(light: Any, spot: Detection | None) -> str:

@@ -302,7 +302,8 @@ class RunPanel:
         names = {one.id: self.page.sensor.name(one.id) for one in lights}
         self.strips.run_method("show", drawn, kept.strips if kept else [], end_s, names)
         frames = [
-            (one.row.t_s, one.row.status, one.row.wrong, one.saturated) for one in self.rows
+            (one.row.t_s, one.row.status, one.row.wrong, one.saturated, one.row.filter)
+            for one in self.rows
         ]
         self.timeline.run_method("show", frames, self.limits, end_s)
         info = self.page.scene_info

@@ -126,6 +126,7 @@ class Tab(context.PageContext):
             self.head = head.Head(self)
             self.sensor = sensor.SensorView(self.id, self.contents)
             self.sensor.show_setting_up(self.state.scene)
+            self.derive(lambda view: view.image, self.sensor.empty)
             await asyncio.sleep(PAUSE_S)
             with widgets.div("lab-side"):
                 head.Arrangement.splitter("side", "vertical", "Width of the panels")

@@ -67,6 +67,8 @@ class SensorView:
         Place of the light under the mouse, or None
     sent_number
         Number of the last frame sent to the browser
+    has_image
+        Whether there is an image, or soon will be
     frames
         The newest frames
     """
@@ -81,6 +83,7 @@ class SensorView:
     statistics = ""  # numbers of the frame, shown while no light is under the mouse
     hover_px: tuple[float, float] | None = None
     sent_number = 0
+    has_image = False
 
     def __init__(self, id: str, contents: widgets.Contents) -> None:
         self.id = id
@@ -112,6 +115,24 @@ class SensorView:
         """Show what the first frame waits for and since when; with `in_vain`, why there is none."""
         self.wait_label.set_text("\n".join(lines))
         self.waited.set_visibility(not in_vain)
+
+    def empty(self) -> None:
+        """Show no image, unless the next one follows at once."""
+        self.has_image = False
+        if asyncio._get_running_loop() is not None:
+            asyncio.get_running_loop().call_soon(self.blank)
+
+    def blank(self) -> None:
+        if self.has_image:
+            return
+        self.lights = NO_LIGHTS
+        self.result = None
+        self.statistics = ""
+        self.hover_px = None
+        self.update_text()
+        self.canvas.run_method("empty", self.sent_number)
+        self.sent_number += 1  # the table of lights is another one
+        self.wait.set_visibility(True)
 
     def build_controls(self) -> None:
         with widgets.div("lab-bar"):
@@ -200,8 +221,8 @@ class SensorView:
             self.lens = of.lens
             self.canvas.run_method("setLens", of.lens)
         self.update_text()
-        if not self.sent_number:
-            self.wait.set_visibility(False)
+        self.has_image = True
+        self.wait.set_visibility(False)
         self.sent_number += 1  # so that each frame has its own address
         fields = self.fields() | {"contents": self.contents.take()}
         overlay.FRAMES[self.id] = self.frames

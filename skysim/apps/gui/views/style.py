@@ -134,6 +134,13 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-timeline span {{ position: absolute; left: 0; font-size: 11px; line-height: 14px; pointer-events: none }}
 .lab-timeline button {{ position: absolute; top: 15px; height: 9px; min-width: 5px; padding: 0; border: 0;
   transform: translateX(-2px); cursor: pointer }}
+.lab-coverage > svg {{ display: block; width: 100%; max-width: 380px }} .lab-coverage p {{ margin: 2px 0 }}
+.lab-coverage [role=button] {{ cursor: pointer }} .lab-coverage path {{ fill-opacity: .25; stroke-width: 2 }}
+.lab-coverage text {{ fill: {COLORS["text"]}; font-size: 11px; text-anchor: middle; pointer-events: none }}
+.lab-coverage .ring circle {{ fill: none; stroke: {COLORS["line"]} }}
+.lab-coverage .ring text {{ fill: {COLORS["quiet"]}; font-size: 9px }}
+.lab-coverage .legend {{ display: flex; flex-wrap: wrap; gap: 2px 12px; align-items: center }}
+.lab-coverage .legend svg {{ display: inline; width: 16px; vertical-align: -3px; margin-right: 4px }}
 .lab-dots {{ position: absolute; left: 0; top: 0; pointer-events: none }}
 .mono.lab-log {{ white-space: pre-wrap; overflow-wrap: anywhere }}
 .q-uploader__subtitle {{ display: none }} .q-uploader__title {{ font-size: 13px; font-weight: 500 }}
@@ -148,8 +155,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 .lab-lights {{ width: 100%; border-collapse: collapse; cursor: default; text-align: right }}
 .lab-lights th {{ position: sticky; top: -10px; font-weight: normal; color: {COLORS["quiet"]};
   background: {COLORS["panel"]} }}
-.lab-lights {{ font-size: 11.5px }} .lab-lights th {{ white-space: normal }}
-.lab-lights tr > * {{ padding-left: 7px }} .lab-lights tr > :is(:first-child, :last-child) {{ width: 18%; max-width: 0;
+.lab-lights.mono {{ font-size: 11px }} .lab-lights th {{ white-space: normal }}
+.lab-lights tr > * {{ padding-left: 5px }} .lab-lights tr > :is(:first-child, :last-child) {{ width: 17%; max-width: 0;
   overflow: hidden; text-overflow: ellipsis }}
 .lab-lights tr > :first-child {{ text-align: left }} .lab-lights tr.ringed {{ background: {COLORS["line"]} }}
 .lab-turn {{ position: absolute; left: 8px; bottom: 6px; font-size: 11px; pointer-events: none; color: #aab3c2;
@@ -230,6 +237,7 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
 }}
 @media (max-width: 600px) {{
   .lab-trial {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
+  .lab-lights tr > :is(:nth-child(6), :nth-child(7)) {{ display: none }}
   .lab-grid {{ grid-template-columns: 60px repeat(3, minmax(0, 1fr)); gap: 2px 6px }}
 }}
 @media (prefers-reduced-motion: reduce) {{

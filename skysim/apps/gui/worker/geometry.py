@@ -28,6 +28,7 @@ from skysim.results import scoring
 from skysim.scene.scene import Scene
 from skysim.scene.sections.light import CollimatedDisplayConfig
 from skysim.scene.sections.motion import AttitudeConfig
+from skysim.simulation.checks import attitudes
 from skysim.simulation.lab import MARGIN_S, Lab, exposure_window
 from skysim.sources import stars
 from skysim.sources.dome import surface
@@ -36,6 +37,9 @@ from skysim.tracking.onboard_model import calibration
 MAX_STARS = 600
 MAX_LEDS = 4000
 WIDE_DEG = 100.0  # field of the view from the bearing
+NEARLY = (
+    0.999  # fraction of the vehicle's greatest tilt that is within it in spite of rounding
+)
 AXIS = 0.35  # length of the axes, relative to the viewing distance of the laboratory
 MOST_AXIS_M = 1.2
 DIGITS = 5  # decimals of lengths in meters
@@ -187,6 +191,18 @@ def moved(
     new_from_cam = Rotation.from_rotvec(turn_deg, degrees=True).inv()
     cam_from_lab = new_from_cam * cam_from_body * lab_from_body.inv()
     return within_stop(lab.scene, cam_from_lab.inv() * cam_from_body)
+
+
+def in_reach(lab: Lab) -> tuple[list[Triple], Floats]:
+    """The angles of `checks.attitudes.within_reach` up to the vehicle's stop, and (N, 3) boresights in lab axes.
+
+    They are those of `skysim check`; under the stars, all directions.
+    """
+    tilt_deg = NEARLY * lab.scene.vehicle.tilt_stop_deg
+    found = attitudes.within_reach(attitudes.of_frames(lab), tilt_deg)
+    cams_from_lab = lab.camera.mount.cam_from_body * found.lab_from_body.inv()
+    angles_deg = [scoring.angles_deg(one, lab.camera) for one in cams_from_lab]
+    return angles_deg, found.boresights
 
 
 def within_stop(scene: Scene, lab_from_body: Rotation) -> Rotation:

@@ -28,7 +28,9 @@ from skysim.apps.gui.worker import (
 )
 from skysim.apps.gui.worker.workbench import Workbench, ambiguity
 from skysim.core.errors import InputError
+from skysim.core.types import Floats
 from skysim.core.yaml_reader import OverrideTexts
+from skysim.results.scoring import FrameRow
 from skysim.simulation import checks
 from skysim.simulation.checks.plan_check import Check
 from skysim.simulation.lab import MAIN
@@ -204,6 +206,15 @@ class Worker:
 
     def ambiguity(self) -> AmbiguityMap:
         return ambiguity(self.workbench.lab)
+
+    def reach(self) -> tuple[list[Triple], Floats]:
+        """Attitudes in reach of the vehicle, and boresights."""
+        return geometry.in_reach(self.workbench.lab)
+
+    def cover(self, angles_deg: Triple) -> tuple[int, FrameRow]:
+        """Number of lights in the field at an attitude, and the tracker's result there."""
+        bench = self.workbench
+        return bench.cover(geometry.from_angles(bench.lab, angles_deg))
 
     def plan_survey(self, frames: int) -> SurveyPlan:
         """Begin a survey of the scene's dome."""

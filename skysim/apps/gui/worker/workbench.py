@@ -186,6 +186,14 @@ class Workbench:
         """The lab of the newest run."""
         return self.lab.in_run(self.scene.seed + self.rendered_count)
 
+    def cover(self, lab_from_body: Rotation) -> tuple[int, scoring.FrameRow]:
+        """Number of lights in the field at an attitude at rest, and the frame in numbers; the shown frame stays."""
+        trajectory = Trajectory.at_rest(lab_from_body, frame_end_s(self.scene, 0))
+        camera = self.next_run().camera
+        frame, truth = exposure.render_frame(camera, trajectory, 0)
+        report = factory.solve_frame(self.estimator, frame)
+        return len(truth.sources.id), scoring.row(camera, frame, truth, report)
+
     def next_run(self) -> Lab:
         """The lab of the next run, with independent noise."""
         self.rendered_count += 1
@@ -253,8 +261,13 @@ def true_lights(truth: Truth, magnitude: Mapping[int, float]) -> Lights:
     rows = np.argsort(-sources.electrons)
     ids = sources.id[rows]
     magnitudes = [of_bodies.get(id, magnitude.get(id, math.nan)) for id in ids.tolist()]
-    xy_px = sources.flux_xy_px[rows]
-    return np.rec.fromarrays([ids, xy_px, sources.electrons[rows], magnitudes], LIGHT)
+    charges = (
+        sources.electrons[rows],
+        magnitudes,
+        sources.peak_e[rows],
+        sources.saturated[rows],
+    )
+    return np.rec.fromarrays([ids, sources.flux_xy_px[rows], *charges], LIGHT)
 
 
 def magnitude_by_id(lab: Lab) -> dict[int, float]:

@@ -13,7 +13,8 @@ export default {
     </div>`,
   data: () => ({ lanes: [] }),
   methods: {
-    // frames: [time, status, whether wrong, saturated pixels] each;  limits: [name, from, to] each;  end: of the flight
+    // frames: [time, status, whether wrong, saturated pixels, answer of the filter] each;  limits: [name, from, to] each;
+    // end: of the flight
     show(frames, limits, end) {
       const lanes = new Map();
       const add = (name, from, to, text, color) => {
@@ -25,9 +26,11 @@ export default {
         lane.count += 1;
         lane.events.push({ at: from, text: `${from.toFixed(2)} s: ${text}`, style });
       };
-      for (const [t, status, isWrong, saturated] of frames) {
+      for (const [t, status, isWrong, saturated, filter] of frames) {
         if (isWrong) add("wrong", t, t, "wrong attitude", COLORS.wrong);
         if (status !== "solved") add("refused", t, t, `refused: ${status}`, COLORS.refused);
+        // Without a solution the filter repeats the tracker's reason.
+        if (status === "solved" && filter && filter !== "used") add("filter", t, t, `the filter ${filter}`, COLORS.refused);
         if (saturated) add("saturated", t, t, `${saturated} pixels saturated`, COLORS.saturated);
       }
       for (const [name, from, to] of limits) add(name, from, to, `${name} until ${to.toFixed(2)} s`, "warn");

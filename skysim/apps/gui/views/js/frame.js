@@ -69,6 +69,7 @@ export default {
       fetchedSrc: null,
       inFlight: 0, // frames that are fetched or drawn
       newest: 0, // greatest number of a frame that has come
+      emptied: 0, // number of the last frame before the view was emptied
       isListening: false, // whether a stream of frames is open
       queue: Promise.resolve(),
       space: [0, 0], // width and height of the canvas
@@ -150,6 +151,15 @@ export default {
       this.fetchedSrc = src;
       this.enqueue(this.begun, frame, true);
     },
+    // Show no image: those up to a number are not what the page is about.
+    empty(number) {
+      clearTimeout(this.atRest);
+      Object.assign(this, { emptied: number, drawn: null, cursor: null, pinned: null, cut: null, hovered: null, hoverKey: null });
+      const { frame, loupe, plot, readout } = this.$refs;
+      for (const canvas of [frame, loupe, plot]) [canvas.width, canvas.ariaLabel] = [0, "no image"];
+      delete frame.dataset.frame;
+      readout.textContent = "";
+    },
     setLens(lens) {
       this.lens = lens;
     },
@@ -190,6 +200,7 @@ export default {
     // Draw a fetched frame, or other marks of the one that is drawn.
     take(view, lens, frame, isNew) {
       if (frame?.src !== view.src) return; // the fetch has failed; a newer frame will be announced
+      if (numberOf(view.src) <= this.emptied) return;
       if (String(frame.size) !== String(this.drawn?.size)) this.zoom = this.cut = this.pinned = null;
       this.drawn = { ...frame, ...view, view, lens };
       if (isNew) this.recolor();
@@ -206,7 +217,7 @@ export default {
       const { drawn, manual } = this, { limits: named, curve } = this.display;
       if (this.inFlight || !drawn || (drawn.isWhole && always !== true)) return;
       const frame = await this.fetchFrame(drawn.src, true);
-      if (!frame || this.drawn.src !== drawn.src) return;
+      if (!frame || this.drawn?.src !== drawn.src) return;
       if (this.display.limits !== named || this.display.curve !== curve || this.manual !== manual) return; // chosen since
       const { pixels, isWhole, limits, histogram } = frame;
       this.drawn = { ...this.drawn, pixels, isWhole, limits, histogram };

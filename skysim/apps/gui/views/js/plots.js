@@ -55,7 +55,8 @@ export function drawHistogram(pen, { pixels, histogram, well }, levels, [width, 
 }
 
 export const electrons = (dn, [gain, bias]) => Math.max(0, gain * (dn - bias));
-export const brief = (e) => (e < 1e4 ? e.toFixed(0) : `${(e / 1000).toPrecision(3)} k`);
+export const brief = (e) =>
+  e < 1e4 ? e.toFixed(0) : e < 999.5e3 ? `${(e / 1e3).toPrecision(3)} k` : `${(e / 1e6).toPrecision(3)} M`;
 
 // Which of the two limits is nearer to a place on the axis.
 export function nearestLevel(axis, levels, x) {

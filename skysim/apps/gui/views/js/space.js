@@ -10,6 +10,7 @@ const REACH_PX = 12;
 const PULL_MS = 40; // between two messages of a drag
 const NEAR_M = 0.02, FAR_M = 60;
 const ARROW = 0xff5fa8;
+const DOT_PX = 5, NEARER = 0.97; // a dot of the map of coverage, and its distance over that of a light
 const INSIDE = ["camera", "bearing"]; // views in which vehicle and axes would be in the way
 
 export default {
@@ -49,10 +50,12 @@ export default {
     this.sight.observe(this.$el);
     window.addEventListener("skysim-hover", this.ring);
     window.addEventListener("skysim-arrows", this.drawArrows);
+    window.addEventListener("skysim-coverage", this.drawCoverage);
   },
   beforeUnmount() {
     window.removeEventListener("skysim-hover", this.ring);
     window.removeEventListener("skysim-arrows", this.drawArrows);
+    window.removeEventListener("skysim-coverage", this.drawCoverage);
     this.watcher?.disconnect();
     this.sight?.disconnect();
     this.renderer?.dispose();
@@ -115,6 +118,21 @@ export default {
       this.arrowLines.frustumCulled = false;
       this.world.add(this.arrowLines);
       this.$refs.canvas.dataset.arrows = ends.length / 2;
+      this.draw();
+    },
+    // Dots where the boresight meets the lights: [direction, color] each.
+    drawCoverage({ detail: { dots } }) {
+      if (!this.vehicle) return;
+      this.world.remove(this.dots);
+      const geometry = new THREE.BufferGeometry(), place = new THREE.Vector3();
+      const reach = NEARER * place.fromArray(this.lab.lights.place, 0).length();
+      const tints = dots.flatMap(([, color]) => new THREE.Color(color).toArray());
+      geometry.setFromPoints(dots.map(([at]) => new THREE.Vector3(...at).multiplyScalar(reach)));
+      geometry.setAttribute("color", new THREE.Float32BufferAttribute(tints, 3));
+      this.dots = new THREE.Points(geometry, new THREE.PointsMaterial({ size: DOT_PX, sizeAttenuation: false, vertexColors: true }));
+      this.dots.frustumCulled = false;
+      this.world.add(this.dots);
+      this.$refs.canvas.dataset.dots = dots.length;
       this.draw();
     },
     // Look from a preset: [eye, target, up, vertical field in degrees, whether they are in body axes].
