@@ -84,12 +84,14 @@ def build(folder: Path, rows: int, points: int) -> None:
 
 def insert(database: store.Store, columns: dict[str, NDArray[Any]]) -> None:
     """Add rows to SQLite."""
-    names = [name for name in store.COLUMNS if name != "time_ms"]
+    names = [name for name in store.COLUMNS if name not in store.TIMES]
     values = zip(*(map(store.to_sql, columns[name].tolist()) for name in names), strict=True)
     with database.db:
         database.db.executemany(store.INSERT, values)
-        times = zip(columns["trial"].tolist(), columns["time_ms"].tolist(), strict=True)
-        database.db.executemany("INSERT INTO timings VALUES (?, ?)", times)
+        times = zip(
+            *(columns[name].tolist() for name in ("trial", *store.TIMES)), strict=True
+        )
+        database.db.executemany("INSERT INTO timings VALUES (?, ?, ?, ?)", times)
 
 
 def drawn(first: int, count: int, each: int) -> dict[str, NDArray[Any]]:
