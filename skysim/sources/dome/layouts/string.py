@@ -149,7 +149,7 @@ def mean_meridian(surface: Surface, half_rad: float) -> Meridian:
     """The surface's mean meridian over the cap. Raises InputError if the cap exceeds the surface."""
     tilt_rad = np.linspace(0, half_rad, MERIDIAN_STEPS + 1)
     azimuth_rad = np.arange(MERIDIANS) * (2 * np.pi / MERIDIANS)
-    rays = directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
+    rays = directions(tilt_rad[:, None], azimuth_rad)
     place_m = project_from_bearing(surface, rays.reshape(-1, 3)).reshape(rays.shape)
     # Chords along the meridians and around the circles.
     step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=2).mean(axis=1)
