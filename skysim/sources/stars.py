@@ -26,7 +26,7 @@ from skysim.core.types import (
     normalized,
 )
 from skysim.sources.catalog import Catalog
-from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
+from skysim.sources.photometry import Band, Reals, star_chromatic, star_flux_e_s_m2
 
 LAST_HIPPARCOS = 120_416  # number of the catalog's last star
 AT_REST = (0.0, 0.0, 0.0)  # velocity of an observer at the Earth's center
@@ -199,9 +199,7 @@ def directions(ra_deg: Any, dec_deg: Any) -> Floats:
     return sky_axes(np.radians(ra_deg), np.radians(dec_deg))[2]
 
 
-def cam_from_icrs(
-    ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats
-) -> Rotation:
+def cam_from_icrs(ra_deg: Reals, dec_deg: Reals, roll_deg: Reals) -> Rotation:
     """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
     Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows. Up is
