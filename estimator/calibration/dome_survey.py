@@ -28,7 +28,7 @@ then wrong by about 0.1 percent, whatever the number of lights. The start map co
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.linalg import LinAlgError
@@ -37,6 +37,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, check_lever
 from estimator.calibration import bundle_adjustment as ba
 from estimator.calibration.bundle_adjustment import Assumed, Bundle, Sightings
+from estimator.calibration.survey_faults import HeldFrames
 from estimator.calibration.survey_subset import (
     Covariances,
     Subset,
@@ -83,7 +84,7 @@ class DomeFrame:
 
 
 @frozen
-class DomeSurvey:
+class DomeSurvey(HeldFrames):
     """Result of a dome survey.
 
     The covariances are of errors against the truth.
@@ -126,11 +127,7 @@ class DomeSurvey:
     """
 
     status: str
-    leds: LedMap
     surveyed: np.ndarray
-    lever: Lever
-    camera: Camera
-    body_from_lab: Rotation
     tied: np.ndarray
     outliers: Ints
     led_covariance_m2: Floats
@@ -216,68 +213,61 @@ def survey(
     attitudes = Rotation.concatenate([frame.body_from_lab for frame in frames])
     start = Bundle.start(leds_start, lever_start, camera_start, attitudes, fit_distortion)
     start = replace(start, map_sigma_m=leds_sigma_m, assumed=assumed)
-    fit = _fit(start, sightings, fit_noise)
-    # The frame, and the row in it, of each rejected sighting.
-    outliers = sightings.in_frames[~fit.keep]
-    return _report(fit, start, outliers, leds_start, camera_start)
+    try:
+        return _fit(start, sightings, fit_noise, leds_start, camera_start)
+    except LinAlgError:
+        raise ValueError(
+            "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
+        ) from None
 
 
-class _Fit(NamedTuple):
-    """A fitted subset, the (M,) mask of sightings kept, the quality of the fit, and its common errors."""
-
-    subset: Subset
-    keep: np.ndarray
-    status: str
-    covariances: Covariances
-    misfit: float
-    noise_scale: float
-    common: tuple[Floats, Floats]
-
-
-def _fit(start: Bundle, sightings: Sightings, fit_noise: bool) -> _Fit:
+def _fit(
+    start: Bundle, sightings: Sightings, fit_noise: bool, leds: LedMap, camera: Camera
+) -> DomeSurvey:
     """Fit the connected subset of the observations: the numbered steps of the module.
 
     Raises
     ------
-    ValueError
+    LinAlgError
         If the lever or the lens is undetermined.
     """
     scale = 1.0
-    try:
-        # 1. Wrong identifications
-        start, keep = _reject_misidentified(start, sightings)
-        # 2. Connected subset
-        subset = connected_subset(start, sightings, keep)
-        for _ in range(NOISE_ROUNDS if fit_noise else 1):
-            # 3. Least squares
-            scaled = replace(
-                subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index]
-            )
-            fitted, status = ba.adjust(subset.bundle, scaled, np.inf)
-            subset = replace(subset, bundle=fitted, sightings=scaled)
-            # 4. Covariances, misfit, and noise
-            covariances = covariance(subset.terms, fitted)
-            if fit_noise:
-                check_redundancy(subset, covariances)
-            chi2 = np.sum(ba.residuals(fitted, scaled) ** 2)
-            misfit = float(np.sqrt(chi2 / max(redundancy(subset, covariances), 1)))
-            if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
-                break
-            scale *= misfit
-        common = common_errors(subset.terms, fitted)
-        # The lever to 10 % of the least LED distance, and the focal length to 10 %
-        sigma = np.sqrt(np.maximum(np.diag(covariances.shared), 0))
-        nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
-        determined = sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0]
-        determined = determined and np.isfinite(sigma).all()
-    except LinAlgError:
-        # A singular matrix raises the same ValueError as a nearly singular one
-        determined = False
-    if not determined:
-        raise ValueError(
-            "survey: the frames do not determine the lever or the lens; take more tilts and yaws"
-        )
-    return _Fit(subset, keep, status, covariances, misfit, scale, common)
+    # 1. Wrong identifications
+    improved, keep = _reject_misidentified(start, sightings)
+    # 2. Connected subset
+    subset = connected_subset(improved, sightings, keep)
+    for _ in range(NOISE_ROUNDS if fit_noise else 1):
+        # 3. Least squares
+        scaled = replace(subset.sightings, sigma_px=scale * sightings.sigma_px[subset.index])
+        fitted, status = ba.adjust(subset.bundle, scaled, np.inf)
+        subset = replace(subset, bundle=fitted, sightings=scaled)
+        # 4. Covariances, misfit, and noise
+        covariances = covariance(subset.terms, fitted)
+        if fit_noise:
+            check_redundancy(subset, covariances)
+        chi2 = np.sum(ba.residuals(fitted, scaled) ** 2)
+        misfit = float(np.sqrt(chi2 / max(redundancy(subset, covariances), 1)))
+        if not fit_noise or abs(misfit - 1) < NOISE_TOLERANCE or not misfit > 0:
+            break
+        scale *= misfit
+    # The lever to 10 % of the least LED distance, and the focal length to 10 %
+    sigma = np.sqrt(np.maximum(np.diag(covariances.shared), 0))
+    nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
+    determined = sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0]
+    if not (determined and np.isfinite(sigma).all()):
+        raise LinAlgError
+    return _report(
+        start,
+        subset,
+        covariances,
+        leds,
+        camera,
+        status=status,
+        # The frame, and the row in it, of each rejected sighting.
+        outliers=sightings.in_frames[~keep],
+        misfit=misfit,
+        noise_scale=scale,
+    )
 
 
 def redundancy(subset: Subset, covariances: Covariances) -> float:
@@ -371,10 +361,14 @@ def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
 
 
 def _report(
-    fit: _Fit, start: Bundle, outliers: Ints, leds: LedMap, camera: Camera
+    start: Bundle,
+    subset: Subset,
+    covariances: Covariances,
+    leds: LedMap,
+    camera: Camera,
+    **quality: Any,
 ) -> DomeSurvey:
-    """Return the survey's result: the fitted subset in the full set of lights and frames."""
-    subset = fit.subset
+    """Return the survey's result: the fitted subset in the full set of lights and frames, with its quality."""
     full = subset.insert_into(start, subset.bundle)
     lights = len(full.position_m)
     frames = len(full.R_body_from_lab)
@@ -384,28 +378,26 @@ def _report(
     # Covariances of the subset; NaN elsewhere
     by_led = np.full((lights, 3, 3), np.nan)
     by_rotation = np.full((frames, 3, 3), np.nan)
-    by_led[subset.led], by_rotation[subset.frame], shared = fit.covariances
+    by_led[subset.led], by_rotation[subset.frame], shared = covariances
     residual = ba.residuals(subset.bundle, subset.sightings)
     residual_px = residual * subset.sightings.sigma_px[:, None]
-    common_m = np.zeros((len(fit.common[0]), lights, 3))
-    common_m[:, subset.led], by_camera = fit.common
+    common, by_camera = common_errors(subset.terms, subset.bundle)
+    common_m = np.zeros((len(common), lights, 3))
+    common_m[:, subset.led] = common
     common_camera = np.pad(by_camera, ((0, 0), (0, 8 - full.free_lens)))
     return DomeSurvey(
-        fit.status,
-        replace(leds, position_m=full.position_m),
-        surveyed,
-        Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),
-        camera.with_lens(full.lens),
-        Rotation.from_matrix(full.R_body_from_lab),
-        tied,
-        outliers,
-        by_led,
-        by_rotation,
+        leds=replace(leds, position_m=full.position_m),
+        surveyed=surveyed,
+        lever=Lever(full.camera_body_m, Rotation.from_matrix(full.R_cam_from_body)),
+        camera=camera.with_lens(full.lens),
+        body_from_lab=Rotation.from_matrix(full.R_body_from_lab),
+        tied=tied,
+        led_covariance_m2=by_led,
+        attitude_covariance_rad2=by_rotation,
         lever_covariance_m2=shared[:3, :3],
         lens_covariance=shared[3:, 3:],
         rms_px=float(np.sqrt(np.mean(residual_px**2))),
-        misfit=fit.misfit,
-        noise_scale=fit.noise_scale,
         common_m=common_m,
         common_camera=common_camera,
+        **quality,
     )

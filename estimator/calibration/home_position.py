@@ -11,7 +11,6 @@ takes these steps:
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -134,22 +133,8 @@ def pooled(value: Floats, group: Ints) -> Floats:
     return np.sqrt(_covariance(value[:, None], group)[:, 0, 0])
 
 
-class _Samples(NamedTuple):
-    """Every light of every frame, (S,) each: row of its id, frame, stop, (S, 3) positions in body and in lab axes."""
-
-    led: Ints
-    frame: Ints
-    stop: Ints
-    body_m: Floats
-    lab_m: Floats
-    brightness: Floats
-
-
 def calibrate(
-    sightings: Sequence[Sighting],
-    camera: Camera,
-    surface: LedMap,
-    lever: Lever,
+    sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever
 ) -> HomeCatalog:
     """Return the catalog and its epsilons by AFIT's procedure (Padro 2012, sections 3.6.3-3.6.4 and 4.4.1).
 
@@ -173,40 +158,43 @@ def calibrate(
     checks.of_type("camera", camera, Camera)
     checks.of_type("surface", surface, LedMap)
     checks.of_type("lever", lever, Lever)
-    # 1. Positions in the lab
-    id_, samples = _lab_positions(sightings, camera, surface, lever)
+    _check_lights(sightings)
+    # 1. Positions in the lab of every light of every frame, with the IMU's attitude
+    frame = np.repeat(np.arange(len(sightings)), [len(one.led) for one in sightings])
+    ids, xy_px, brightness = (
+        np.concatenate([getattr(one, name) for one in sightings])
+        for name in ("led", "xy_px", "brightness")
+    )
+    id_, led = np.unique(ids, return_inverse=True)
+    body_m = body_positions(xy_px, camera, surface, lever)
+    attitudes = Rotation.concatenate([one.body_from_lab for one in sightings])
+    lab_m = attitudes[frame].inv().apply(body_m)
     # 2. Repeatability
-    covariance_m2 = _covariance(samples.lab_m, samples.led)
+    covariance_m2 = _covariance(lab_m, led)
     epsilons = (
-        _maximum(pooled(samples.brightness, samples.led), "light"),
+        _maximum(pooled(brightness, led), "light"),
         _maximum(np.sqrt(np.einsum("nii->ni", covariance_m2)), "light"),
-        _maximum(pooled(*_separations(samples)), "pair of lights"),
+        _maximum(pooled(*_separations(body_m, frame, led)), "pair of lights"),
     )
     # 3. Catalog of the lights at home, brightest first
-    at_home = samples.stop == sightings[0].stop
-    led = samples.led[at_home]
+    at_home = np.array([one.stop == sightings[0].stop for one in sightings])[frame]
+    led = led[at_home]
     count = np.bincount(led)
-    columns = (*samples.lab_m[at_home].T, samples.brightness[at_home])
+    columns = (*lab_m[at_home].T, brightness[at_home])
     total = [np.bincount(led, column) for column in columns]
     mean = np.column_stack(total) / np.maximum(count, 1)[:, None]
     # Lights that are not among the samples have a count of 0.
     order = np.argsort(-mean[:, 3], kind="stable")
     order = order[count[order] > 0]
+    place_m = mean[order, :3]
+    samples = (covariance_m2[order], count[order])
     return HomeCatalog(
-        id_[order],
-        normalized(mean[order, :3]),
-        mean[order, 3],
-        mean[order, :3],
-        covariance_m2[order],
-        count[order],
-        *epsilons,
+        id_[order], normalized(place_m), mean[order, 3], place_m, *samples, *epsilons
     )
 
 
-def _lab_positions(
-    sightings: Sequence[Sighting], camera: Camera, surface: LedMap, lever: Lever
-) -> tuple[Ints, _Samples]:
-    """Return the ids seen, and each light of each frame transformed to the lab frame with the IMU's attitude."""
+def _check_lights(sightings: Sequence[Sighting]) -> None:
+    """Raise ImageError for the first sighting whose lights are inconsistent."""
     if not len(sightings):
         raise ImageError("no sightings; allowed: at least two frames")
     for index, sighting in enumerate(sightings):
@@ -224,26 +212,14 @@ def _lab_positions(
             raise ImageError(f"sighting {index}: an id occurs twice; allowed: each id once")
         if not (np.isfinite(sighting.xy_px).all() and np.isfinite(sighting.brightness).all()):
             raise ImageError(f"sighting {index}: a centroid or a brightness is not finite")
-    lights = [len(sighting.led) for sighting in sightings]
-    frame = np.repeat(np.arange(len(sightings)), lights)
-    stop = np.repeat([sighting.stop for sighting in sightings], lights)
-    ids, xy_px, brightness = (
-        np.concatenate([getattr(sighting, name) for sighting in sightings])
-        for name in ("led", "xy_px", "brightness")
-    )
-    id_, led = np.unique(ids, return_inverse=True)
-    body_m = body_positions(xy_px, camera, surface, lever)
-    attitudes = Rotation.concatenate([sighting.body_from_lab for sighting in sightings])
-    lab_m = attitudes[frame].inv().apply(body_m)
-    return id_, _Samples(led, frame, stop, body_m, lab_m, brightness)
 
 
-def _separations(samples: _Samples) -> tuple[Floats, Ints]:
+def _separations(body_m: Floats, frame: Ints, led: Ints) -> tuple[Floats, Ints]:
     """Return the angle about the bearing of every pair in every frame (eq. 45), and its pair's number."""
     # All pairs of each frame
-    direction = normalized(samples.body_m)
-    first = np.flatnonzero(np.diff(samples.frame)) + 1
-    frames = np.split(np.arange(len(samples.led)), first)
+    direction = normalized(body_m)
+    first = np.flatnonzero(np.diff(frame)) + 1
+    frames = np.split(np.arange(len(led)), first)
     a, b = np.hstack([rows[np.array(np.triu_indices(len(rows), 1))] for rows in frames])
     if not len(a):
         raise ImageError(
@@ -251,8 +227,8 @@ def _separations(samples: _Samples) -> tuple[Floats, Ints]:
         )
     angle = separation_rad(direction[a], direction[b])
     # One number for each pair of lights, in whichever order they occur
-    low, high = np.sort([samples.led[a], samples.led[b]], axis=0)
-    _, pair = np.unique(low * (samples.led.max() + 1) + high, return_inverse=True)
+    low, high = np.sort([led[a], led[b]], axis=0)
+    _, pair = np.unique(low * (led.max() + 1) + high, return_inverse=True)
     return angle, pair
 
 

@@ -18,7 +18,7 @@ from estimator.calibration.bundle_adjustment import (
     Sightings,
     eliminate_lights,
 )
-from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.checks import Bools, Floats, Ints, frozen
 from estimator.core.vectors import normalized
 
 # Least rms angle of the rays to one light from their main direction; below it, the distance is undetermined.
@@ -156,6 +156,17 @@ def ray_angles(
     return np.sqrt(np.where(count > 0, np.maximum(1 - largest, 0.0), 0.0))
 
 
+def connected_group(visible: Bools, first: int, min_shared: int) -> Bools:
+    """(F,) frames of a table (F, N) of lights that share so many with the others of the group that begins with one."""
+    group = np.arange(len(visible)) == first
+    while True:
+        shared = visible & visible[group].any(axis=0)
+        grown = group | (shared.sum(axis=1) >= min_shared)
+        if (grown == group).all():
+            return group
+        group = grown
+
+
 def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
     """Raise Unconnected unless the frames form one group, each sharing two or more lights with the rest.
 
@@ -163,15 +174,8 @@ def _check_one_group(incidence: csr_array, frame_rows: Ints) -> None:
     lights.
     """
     # Frames by lights; the group begins with the frame with the most lights.
-    table = incidence[frame_rows].astype(float)
-    member = np.zeros(len(frame_rows), dtype=bool)
-    member[np.argmax(table.sum(axis=1))] = True
-    while True:
-        leds_in_group = (table.T @ member.astype(float)) > 0
-        grown = member | (table @ leds_in_group.astype(float) >= 2)
-        if (grown == member).all():
-            break
-        member = grown
+    table = incidence[frame_rows].toarray()
+    member = connected_group(table, int(np.argmax(table.sum(axis=1))), 2)
     # The message names one frame of the group and one outside it.
     if not member.all():
         first = frame_rows[member][0]

@@ -17,7 +17,14 @@ from skysim.scene.sections.surroundings import AirConfig, HorizonConfig
 from skysim.scene.sections.vehicle import SiteConfig
 from skysim.sources.bodies import BODIES, BodyLight
 from skysim.sources.catalog import Catalog
-from skysim.sources.photometry import SUN, Band, black_body_v0, complete_colors, temperature_k
+from skysim.sources.photometry import (
+    SUN,
+    Band,
+    Reals,
+    black_body_v0,
+    complete_colors,
+    temperature_k,
+)
 from skysim.sources.refraction import (
     Refraction,
     Weather,
@@ -165,7 +172,7 @@ def air_mass(altitude_rad: Floats) -> Floats:
     return 1 / np.sin(np.radians(h_deg + 244 / (165 + 47 * h_deg**1.1)))
 
 
-def transmission(air_masses: Floats, extinction_mag: float | Floats) -> Floats:
+def transmission(air_masses: Floats, extinction_mag: Reals) -> Floats:
     """Bouguer's law: the fraction 10^(-0.4 k X) of the light passes X air masses."""
     return 10 ** (-0.4 * extinction_mag * air_masses)
 
@@ -231,7 +238,7 @@ class Air:
         row = np.minimum(np.searchsorted(self.star_id, ids), len(self.star_id) - 1)
         return np.where(self.star_id[row] == ids, row, -1)
 
-    def extinction_mag(self, b_v: float | Floats) -> float | Floats:
+    def extinction_mag(self, b_v: Reals) -> Reals:
         """Magnitudes of extinction per air mass: k' + k'' (B-V)."""
         return self.config.extinction_mag + self.config.color_extinction_mag * b_v
 

@@ -4,7 +4,6 @@ A file is ECSV (astropy reads it too): a YAML header that states the epoch and t
 per star, sorted by number. Directions are in the ICRS.
 """
 
-import csv
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import fields, replace
@@ -125,24 +124,21 @@ def write(
         | {"datatype": "int64" if c.format == "d" else "float64"}
         for c in columns
     ] + [{"name": "source", "datatype": "string"}]
-    with (
-        files.atomic_file(path) as temporary,
-        open(temporary, "w", encoding="utf-8", newline="") as out,
-    ):
-        out.write(header_text(datatype, meta | {"rows": len(rows)}))
-        table = csv.writer(out, lineterminator="\n")
-        table.writerow([*(c.name for c in columns), "source"])
-        for row in rows:
-            table.writerow([*(format(row[c.name], c.format) for c in columns), row["source"]])
+    cells = [[*(c.name for c in columns), "source"]]
+    for row in rows:
+        cells.append([*(format(row[c.name], c.format) for c in columns), row["source"]])
+    write_lines(path, datatype, meta, [",".join(line) for line in cells])
 
 
-def header_text(datatype: list[Record], meta: Record) -> str:
-    """The header of an ECSV file: YAML in comments."""
+def write_lines(path: Path, datatype: list[Record], meta: Record, table: list[str]) -> None:
+    """Write an ECSV file: its header, YAML in comments, then the column names and a line a star."""
     head = {"delimiter": ",", "datatype": datatype}
     comment = yaml.safe_dump(head, sort_keys=False, default_flow_style=None)
-    comment += yaml.safe_dump({"meta": meta}, sort_keys=False, width=105)
+    about = meta | {"rows": len(table) - 1}
+    comment += yaml.safe_dump({"meta": about}, sort_keys=False, width=105)
     lines = ["%ECSV 1.0", "---", *comment.splitlines(), SCHEMA]
-    return "".join(f"# {line}\n" for line in lines)
+    text = [*(f"# {line}" for line in lines), *table, ""]
+    files.write_text(path, "\n".join(text))
 
 
 def write_selection(source: Path, path: Path, hip: Ints, rule: str) -> None:
@@ -153,19 +149,15 @@ def write_selection(source: Path, path: Path, hip: Ints, rule: str) -> None:
     rule
         How they were selected, for the header's `selection`
     """
-    meta, lines = read_meta_and_lines(source)
-    comments = [
-        line[2:] for line in source.read_text("utf-8").splitlines() if line[:1] == "#"
-    ]
-    datatype = parse_yaml("\n".join(comments[1:]))[1]["datatype"]
+    head, lines = read_head_and_lines(source)
+    meta = head["meta"]
     column = lines[0].split(",").index("hip")
     selected = set(hip.tolist())
     kept = [line for line in lines[1:] if int(line.split(",")[column]) in selected]
     # A selection of a selection has both rules.
     rules = [meta["selection"], rule] if "selection" in meta else [rule]
-    meta |= {"selection": "; then ".join(rules), "rows": len(kept)}
-    text = "".join(f"{line}\n" for line in [lines[0], *kept])
-    files.write_text(path, header_text(datatype, meta) + text)
+    meta |= {"selection": "; then ".join(rules)}
+    write_lines(path, head["datatype"], meta, [lines[0], *kept])
 
 
 def package_file(package: str) -> str:
@@ -199,7 +191,8 @@ def read(name_or_path: str | Path) -> Catalog:
         With one line, if the file is missing, not a catalog, or truncated.
     """
     path = catalog_path(name_or_path)
-    meta, lines = read_meta_and_lines(path)
+    head, lines = read_head_and_lines(path)
+    meta = head["meta"]
     # A truncated file has fewer rows than its header says.
     rows = len(lines) - 1
     if not 0 < rows == meta["rows"]:
@@ -235,8 +228,8 @@ def read(name_or_path: str | Path) -> Catalog:
     )
 
 
-def read_meta_and_lines(path: Path) -> tuple[Record, list[str]]:
-    """The header's meta, and the lines below the header, the column names first. Raises InputError."""
+def read_head_and_lines(path: Path) -> tuple[Record, list[str]]:
+    """The header, and the lines below the header, the column names first. Raises InputError."""
     try:
         text = read_limited(path, MAX_BYTES)
     except InputError as error:
@@ -246,21 +239,20 @@ def read_meta_and_lines(path: Path) -> tuple[Record, list[str]]:
     header = next((n for n, line in enumerate(lines) if not line.startswith("#")), len(lines))
     # The header must state what `read` needs.
     try:
-        meta = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]["meta"]
-        epoch_jyear = meta["epoch_jyear"]
-        _rows = meta["rows"]
-        valid = {*NUMBERS, "source"} <= set(lines[header].split(","))
+        head = parse_yaml("\n".join(line[2:] for line in lines[1:header]))[1]
+        epoch_jyear = head["meta"]["epoch_jyear"]
+        _rows = head["meta"]["rows"]
+        if not {*NUMBERS, "source"} <= set(lines[header].split(",")):
+            raise KeyError
     except (yaml.YAMLError, TypeError, KeyError, IndexError) as error:
         raise catalog_error(path, "not the header of a skysim catalog") from error
-    if not valid:
-        raise catalog_error(path, "not the header of a skysim catalog")
     if (
         not isinstance(epoch_jyear, int | float)
         or not EPOCHS_JYEAR[0] <= epoch_jyear <= EPOCHS_JYEAR[1]
     ):
         allowed = "a Julian year of {} to {}".format(*EPOCHS_JYEAR)
         raise InputError(path, f"epoch_jyear {excerpt(repr(epoch_jyear))}", allowed)
-    return meta, lines[header:]
+    return head, lines[header:]
 
 
 def catalog_error(path: Path, what: str) -> InputError:
@@ -274,7 +266,7 @@ def info(name_or_path: str | Path) -> Record:
     `sources` has the number of stars by source, `brighter_than` that brighter than each whole V.
     """
     path = catalog_path(name_or_path)
-    meta, lines = read_meta_and_lines(path)
+    head, lines = read_head_and_lines(path)
     stars = read(path)
     # Whole magnitudes up to the faintest star.
     faintest = int(np.ceil(stars.v_mag.max())) if len(stars) else 0
@@ -284,7 +276,7 @@ def info(name_or_path: str | Path) -> Record:
         "stars": len(stars),
         "sources": dict(Counter(line.split(",")[source] for line in lines[1:])),
         "brighter_than": {v: int(np.sum(stars.v_mag < v)) for v in range(faintest + 1)},
-        "meta": meta,
+        "meta": head["meta"],
     }
 
 

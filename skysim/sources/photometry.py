@@ -53,6 +53,8 @@ SUN = (
     0.650,
     0.713,
 )  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
+kept = lru_cache(maxsize=64)  # for what scenes of one process share
+Reals = float | Floats  # one number, or an array of them
 Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
 
 
@@ -113,7 +115,7 @@ class Band:
             return _luma(*(cls.from_efficiency(curve) for _, curve in quantum_efficiency))
         return _flat(float(quantum_efficiency))
 
-    def response_at(self, wavelength_m: Floats | float) -> Floats:
+    def response_at(self, wavelength_m: Reals) -> Floats:
         """The response at wavelengths of any shape, by linear interpolation; 0 beyond the curve's ends."""
         return np.asarray(
             np.interp(wavelength_m, self.wavelength_m, self.response, left=0.0, right=0.0)
@@ -145,32 +147,32 @@ class Band:
         )
 
 
-@lru_cache(maxsize=64)
+@kept
 def _flat(quantum_efficiency: float) -> Band:
     """A constant response over FLAT_M."""
     return Band(np.array(FLAT_M), np.full(2, quantum_efficiency))
 
 
-@lru_cache(maxsize=64)
+@kept
 def _scaled(band: Band, peak: float) -> Band:
     """A response scaled to another peak."""
     return Band(band.wavelength_m, band.response * (peak / band.response.max()))
 
 
-@lru_cache(maxsize=64)
+@kept
 def _luma(*colors: Band) -> Band:
     """The band of the gray image of a red, a green and a blue band."""
     grid_m = np.unique(np.concatenate([color.wavelength_m for color in colors]))
     return Band(grid_m, np.dot(LUMA, [color.response_at(grid_m) for color in colors]))
 
 
-@lru_cache(maxsize=64)
+@kept
 def _through(band: Band, chromatic: ChromaticConfig) -> Band:
     """A response with the chromatic aberration of a lens."""
     return replace(band, chromatic=chromatic)
 
 
-@lru_cache(maxsize=64)
+@kept
 def _product(first: Band, second: Band) -> Band:
     """The product of two curves where both reach, sampled every nanometer and at the samples of both."""
     low_m = max(first.wavelength_m[0], second.wavelength_m[0])
@@ -186,7 +188,7 @@ def _product(first: Band, second: Band) -> Band:
     return Band(grid, first.response_at(grid) * second.response_at(grid))
 
 
-@lru_cache(maxsize=64)
+@kept
 def _read_curve(path: Path, _changed_ns: int = 0, largest: float = 1.0) -> Band:
     """Read a curve: comments (#), a line of names, then lines of wavelength in nm and response, 0 to `largest`.
 
@@ -225,7 +227,7 @@ def stellar_sequence() -> StellarSequence:
     return StellarSequence(*column_numbers(path, rows, rows[0][1][:3]).T)
 
 
-def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, Floats]:
+def complete_colors(b_v: Reals, v_i: Reals) -> tuple[Floats, Floats]:
     """The catalog's colors; a missing one is taken from the stellar sequence at the other one.
 
     Parameters
@@ -255,7 +257,7 @@ def complete_colors(b_v: float | Floats, v_i: float | Floats) -> tuple[Floats, F
     )
 
 
-def temperature_k(b_v: float | Floats, v_i: float | Floats) -> Floats:
+def temperature_k(b_v: Reals, v_i: Reals) -> Floats:
     """A star's effective temperature from its color, along the sequence of real stars.
 
     V-I is used, and B-V only where V-I is missing. V-I spans the wavelengths where silicon is sensitive, still grows
@@ -301,7 +303,7 @@ def black_body_v0(wavelength_m: Floats, temperature_k: Floats) -> Floats:
     return power(wavelength_m) * wavelength_m / HC_J_M * (V0_W_M3 / mean)[..., None]
 
 
-@lru_cache(maxsize=64)
+@kept
 def _black_bodies(band: Band) -> tuple[Floats, Floats]:
     """(256,) inverse temperatures, and log10 of the photo-electrons s^-1 m^-2 at V = 0, a smooth function of them."""
     # Even steps of 1/T, in which the logarithm of the flux is smooth.
@@ -312,9 +314,7 @@ def _black_bodies(band: Band) -> tuple[Floats, Floats]:
     )
 
 
-def star_flux_e_s_m2(
-    v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band
-) -> Floats:
+def star_flux_e_s_m2(v_mag: Reals, b_v: Reals, v_i: Reals, band: Band) -> Floats:
     """Pogson's law for a black body of the star's effective temperature: photo-electrons above the atmosphere.
 
     Returns photo-electrons s^-1 m^-2 of collecting area, in the band and before any loss in the lens:
@@ -334,7 +334,7 @@ def star_flux_e_s_m2(
     return 10.0 ** (log_v0 - 0.4 * np.asarray(v_mag, dtype=float))
 
 
-@lru_cache(maxsize=64)
+@kept
 def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
     """(256,) inverse temperatures, and `chromatic_moments` (256, 4 + 2 K) of black bodies of these temperatures."""
     inverse_k, _ = _black_bodies(band)
@@ -343,7 +343,7 @@ def _black_body_moments(band: Band) -> tuple[Floats, Floats]:
     )
 
 
-def star_chromatic(b_v: float | Floats, v_i: float | Floats, band: Band) -> Floats | None:
+def star_chromatic(b_v: Reals, v_i: Reals, band: Band) -> Floats | None:
     """(..., 4 + 2 K) `chromatic_moments` of stars of these colors; None for a lens without chromatic aberration."""
     if band.chromatic is None:
         return None
@@ -414,9 +414,7 @@ def chromatic_shifts(band: Band, wavelength_m: Floats) -> Floats:
     )
 
 
-def synthetic_mag(
-    v_mag: float | Floats, b_v: float | Floats, v_i: float | Floats, band: Band
-) -> Floats:
+def synthetic_mag(v_mag: Reals, b_v: Reals, v_i: Reals, band: Band) -> Floats:
     """Instrumental magnitude of a star in this band, equal to V for a G2 star.
 
     m = -2.5 log10(e- of the star / e- of a G2 star of V = 0). Shapes as in `star_flux_e_s_m2`.
@@ -426,7 +424,7 @@ def synthetic_mag(
     return -2.5 * np.log10(ratio)
 
 
-def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
+def sky_radiance_e_s_m2_sr(mag_arcsec2: Reals, band: Band) -> Floats:
     """Radiance of a sky with this V magnitude per square arcsecond and sunlight's color.
 
     Moonlight and zodiacal light are sunlight. Airglow has emission lines, which a V magnitude does not describe.
@@ -445,7 +443,7 @@ def sky_radiance_e_s_m2_sr(mag_arcsec2: float | Floats, band: Band) -> Floats:
 
 
 def led_strength_e_s_sr(
-    intensity_cd: float | Floats, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
+    intensity_cd: Reals, spectrum: Spectrum, band: Band, fwhm_m: float | None = None
 ) -> Floats:
     """Candela to photo-electrons s^-1 sr^-1: luminous intensity / luminous efficacy * electrons per joule.
 
@@ -469,7 +467,7 @@ def led_strength_e_s_sr(
 
 
 def radiant_strength_e_s_sr(
-    intensity_w_sr: float | Floats,
+    intensity_w_sr: Reals,
     spectrum: Spectrum,
     band: Band,
     fwhm_m: float | None = None,
@@ -547,10 +545,10 @@ def lumens_per_watt(spectrum: Spectrum, fwhm_m: float | None = None) -> float:
 
 
 def snr(
-    signal_e: float | Floats,
-    area_px: float | Floats,
-    background_e: float | Floats,
-    read_noise_e: float | Floats,
+    signal_e: Reals,
+    area_px: Reals,
+    background_e: Reals,
+    read_noise_e: Reals,
 ) -> Floats:
     """Signal-to-noise ratio of light summed over some pixels: the CCD equation, S / sqrt(S + n (B + R^2)).
 

@@ -135,7 +135,7 @@ def hip2_row(line: str) -> Record:
 
 def supplement_rows() -> list[Record]:
     """The stars that Hipparcos-2 lacks, from the table in the catalogs' folder."""
-    _meta, lines = catalog.read_meta_and_lines(SUPPLEMENT)
+    _head, lines = catalog.read_head_and_lines(SUPPLEMENT)
     rows = []
     for cells in csv.DictReader(lines):
         row: Record = {column.name: float(cells[column.name]) for column in HIPPARCOS_COLUMNS}

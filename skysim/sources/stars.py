@@ -16,9 +16,17 @@ from skysim.core.constants import (
 )
 from skysim.core.random_streams import VARIABLE_STARS, random_stream
 from skysim.core.time import J2000_JD, tt_days
-from skysim.core.types import Floats, Ints, Sources, StarSources, homogeneous, normalized
+from skysim.core.types import (
+    Floats,
+    Ints,
+    Sources,
+    StarSources,
+    around_z,
+    homogeneous,
+    normalized,
+)
 from skysim.sources.catalog import Catalog
-from skysim.sources.photometry import Band, star_chromatic, star_flux_e_s_m2
+from skysim.sources.photometry import Band, Reals, star_chromatic, star_flux_e_s_m2
 
 LAST_HIPPARCOS = 120_416  # number of the catalog's last star
 AT_REST = (0.0, 0.0, 0.0)  # velocity of an observer at the Earth's center
@@ -175,14 +183,15 @@ def steady_points(
 
 def sky_axes(ra_rad: Any, dec_rad: Any) -> tuple[Floats, Floats, Floats]:
     """Unit vectors (..., 3) to the east and to the north of directions on the sky, and along them."""
-    sin_a = np.sin(ra_rad)
-    cos_a = np.cos(ra_rad)
-    sin_d = np.sin(dec_rad)
-    cos_d = np.cos(dec_rad)
-    east = [-sin_a, cos_a, np.zeros_like(sin_a)]
-    north = [-sin_d * cos_a, -sin_d * sin_a, cos_d]
-    toward = [cos_d * cos_a, cos_d * sin_a, sin_d]
-    return np.stack(east, -1), np.stack(north, -1), np.stack(toward, -1)
+    return axes_about_z(ra_rad, np.sin(dec_rad), np.cos(dec_rad))
+
+
+def axes_about_z(azimuth_rad: Any, sine: Any, cosine: Any) -> tuple[Floats, Floats, Floats]:
+    """Unit vectors (..., 3) to the east and toward z of directions, and along them, from azimuth and elevation."""
+    east = np.stack(
+        [-np.sin(azimuth_rad), np.cos(azimuth_rad), np.zeros_like(azimuth_rad)], -1
+    )
+    return east, around_z(-sine, azimuth_rad, cosine), around_z(cosine, azimuth_rad, sine)
 
 
 def directions(ra_deg: Any, dec_deg: Any) -> Floats:
@@ -190,9 +199,7 @@ def directions(ra_deg: Any, dec_deg: Any) -> Floats:
     return sky_axes(np.radians(ra_deg), np.radians(dec_deg))[2]
 
 
-def cam_from_icrs(
-    ra_deg: float | Floats, dec_deg: float | Floats, roll_deg: float | Floats
-) -> Rotation:
+def cam_from_icrs(ra_deg: Reals, dec_deg: Reals, roll_deg: Reals) -> Rotation:
     """Camera attitude from the boresight's right ascension and declination and the position angle of the image's up.
 
     Returns cam_from_icrs; its matrix has the camera's x (right), y (down), z (boresight) as rows. Up is

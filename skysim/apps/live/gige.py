@@ -21,7 +21,6 @@ import functools
 import select
 import socket
 import struct
-import threading
 import time
 import uuid
 from collections import deque
@@ -30,7 +29,7 @@ from enum import IntEnum
 from typing import Any
 
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import Packet, Sink
+from skysim.apps.live.packets import Packet, Sink, start_thread
 from skysim.core import __version__
 from skysim.core.errors import InputError, reason
 from skysim.core.paths import DATA
@@ -190,7 +189,7 @@ class GigeCamera(Sink):
         self.answer_once = functools.lru_cache(maxsize=1)(self.first_answer)
         self.fill_memory()
         super().__init__("gige", self.send_frame, ())
-        threading.Thread(target=self.serve, name="gvcp", daemon=True).start()
+        start_thread(self.serve, "gvcp")
 
     # Registers
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs
 
 from skysim.apps.access import names_address, same_site, token_matches
-from skysim.apps.live.packets import Packet, encode_png
+from skysim.apps.live.packets import Packet, encode_png, start_thread
 from skysim.core import files
 from skysim.core.paths import DATA
 from skysim.results.plots import jpeg, to_8bit
@@ -71,7 +71,7 @@ class FrameServer(ThreadingHTTPServer):
         self.changed = threading.Condition()
         with names_address("--http", host, port):
             super().__init__((host, port), Handler)
-        threading.Thread(target=self.serve_forever, name="http", daemon=True).start()
+        start_thread(self.serve_forever, "http")
 
     def counters(self) -> dict[str, Any]:
         return {"sent": {"frame": self.sent}, "dropped": {}}

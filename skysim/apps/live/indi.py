@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import io
 import logging
-import threading
 import time
 from typing import Any
 
@@ -29,7 +28,7 @@ from indipyserver import IPyServer
 
 from skysim.apps.access import HOST, listen
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import CLOSE_TIMEOUT_S, Packet, Sink
+from skysim.apps.live.packets import CLOSE_TIMEOUT_S, Packet, Sink, start_thread
 from skysim.apps.plate_solver.plate_solution import wcs_header
 from skysim.camera.detector import saturation_dn
 from skysim.core.types import Frame
@@ -80,10 +79,7 @@ class IndiCamera(IPyDriver):
         for package in ("indipydriver", "indipyserver"):
             logging.getLogger(package).setLevel(logging.CRITICAL)
         self.server = IndiServer(self, host=HOST, port=self.port, maxconnections=MOST_CLIENTS)
-        self.thread = threading.Thread(
-            target=lambda: asyncio.run(self.serve()), name="indi", daemon=True
-        )
-        self.thread.start()
+        self.thread = start_thread(lambda: asyncio.run(self.serve()), "indi")
         while self.server.server is None and self.thread.is_alive():
             time.sleep(0.01)
         self.frame = Packet({"index": -1})

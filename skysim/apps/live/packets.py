@@ -253,6 +253,13 @@ class Output(Protocol):
         ...
 
 
+def start_thread(target: Callable[[], None], name: str) -> threading.Thread:
+    """A thread that does not keep the process from ending, started."""
+    thread = threading.Thread(target=target, name=name, daemon=True)
+    thread.start()
+    return thread
+
+
 class Sink:
     """A thread that passes packets to `write`, oldest first. The attributes are those of `Output`, and
 
@@ -277,8 +284,7 @@ class Sink:
         self.packets: deque[Packet] = deque()
         self.ends = False
         self.changed = threading.Condition()
-        self.thread = threading.Thread(target=self.run, name=f"sink {name}", daemon=True)
-        self.thread.start()
+        self.thread = start_thread(self.run, f"sink {name}")
 
     def run(self) -> None:
         """Body of the thread: pass packets on until the end, or until `write` fails."""

@@ -18,7 +18,7 @@ from typing import Any
 from skysim.apps.access import listen, token_matches
 from skysim.apps.live.commands import parse
 from skysim.apps.live.pacing import Live
-from skysim.apps.live.packets import CHANNELS, Packet, Sink
+from skysim.apps.live.packets import CHANNELS, Packet, Sink, start_thread
 from skysim.core.errors import InputError
 
 SOCKET_TIMEOUT_S = 10.0  # time for a first line, and for a client to read what was sent
@@ -36,7 +36,7 @@ class WireClient(Sink):
         connection.settimeout(SOCKET_TIMEOUT_S)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         super().__init__("tcp", self.send, ())
-        threading.Thread(target=self.read, name="wire", daemon=True).start()
+        start_thread(self.read, "wire")
 
     def send(self, packet: Packet) -> None:
         """Send a packet; the truth only to those who take it."""
@@ -125,7 +125,7 @@ class WireServer:
         self.served = 0
         self.listener = listen("--tcp", host, port)
         self.port = int(self.listener.getsockname()[1])
-        threading.Thread(target=self.accept, name="wire accept", daemon=True).start()
+        start_thread(self.accept, "wire accept")
 
     def accept(self) -> None:
         """Body of the thread that waits for clients."""

@@ -291,7 +291,7 @@ def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
     named = survey_faults.name_strays(
         strays, missing, run.listed.position_m, MAX_DISPLACEMENT_M
     )
-    return places | {led: strays[k].position_m for led, k in named}
+    return places | {led: strays[k] for led, k in named}
 
 
 def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:
@@ -394,13 +394,9 @@ def largest_connected_group(visible: Bools, min_shared: int) -> list[int]:
     remaining = np.ones(len(visible), dtype=bool)
     best = np.zeros_like(remaining)
     while remaining.any():
-        group = np.zeros_like(remaining)
-        joins = np.arange(len(visible)) == np.argmax(remaining * (1 + visible.sum(axis=1)))
-        # Add frames that share enough LEDs with the group until it no longer grows.
-        while joins.any():
-            group |= joins
-            shared = visible & visible[group].any(axis=0)
-            joins = remaining & ~group & (shared.sum(axis=1) >= min_shared)
+        first = int(np.argmax(remaining * (1 + visible.sum(axis=1))))
+        left = visible & remaining[:, None]
+        group = survey_subset.connected_group(left, first, min_shared)
         remaining &= ~group
         best = max(best, group, key=np.sum)
     return np.flatnonzero(best).tolist()

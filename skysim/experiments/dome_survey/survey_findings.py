@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
-from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
+from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths
 from skysim.experiments.dome_survey.survey_frames import (
@@ -76,12 +76,6 @@ class SurveyRun:
         ]
 
     @property
-    def held(self) -> HeldFrames:
-        """The frames with their adjusted attitudes and the model found."""
-        survey = self.survey
-        return HeldFrames(survey.camera, survey.leds, survey.lever, survey.body_from_lab)
-
-    @property
     def seen(self) -> Bools:
         """(F, N) mask of the LEDs identified in each frame."""
         return identified([match for _, match in self.pairs], len(self.listed.id))
@@ -132,7 +126,7 @@ def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
     return out
 
 
-def stray_lights(run: SurveyRun) -> list[StrayLight]:
+def stray_lights(run: SurveyRun) -> list[Floats]:
     """Lights at rest in the lab that are not a known LED."""
     number = [np.zeros(0, np.int64)]
     xy_px = [np.zeros((0, 2))]
@@ -141,7 +135,11 @@ def stray_lights(run: SurveyRun) -> list[StrayLight]:
             xy_px.append(np.delete(frame.lights.xy_px, match.light, axis=0))
             number.append(np.full(len(xy_px[-1]), k))
     return survey_faults.stray_lights(
-        run.held, np.concatenate(number), np.concatenate(xy_px), STRAY_SIGMA_PX, STRAY_REACH_M
+        run.survey,
+        np.concatenate(number),
+        np.concatenate(xy_px),
+        STRAY_SIGMA_PX,
+        STRAY_REACH_M,
     )
 
 
@@ -169,7 +167,7 @@ def light_table(run: SurveyRun) -> LightTable:
     place_px = run.accuracy.led_sigma_m * run.prior.px_per_m
     return LightTable(
         light_at_unit_distance(run),
-        run.held.shown(margin_px + GATE_SIGMAS * place_px, 2 * margin_px),
+        run.survey.shown(margin_px + GATE_SIGMAS * place_px, 2 * margin_px),
         run.prior.expected_light(index),
     )
 
@@ -309,7 +307,7 @@ def find_faults(run: SurveyRun) -> Record:
             int(leds.id[row]): survey.leds.position_m[row].tolist()
             for row in (*rows, *(x.led for x in exchanges))
         },
-        "unlisted": [stray.position_m.tolist() for stray in stray_lights(run)],
+        "unlisted": [place_m.tolist() for place_m in stray_lights(run)],
         "exchange_share": share,
     }
 

@@ -492,19 +492,7 @@ def match_by_imu(
         See `prediction_sigmas_px`
     """
     common_px, individual_px = prediction_sigmas_px(prior, map_px)
-    predicted = prior.pixels(frame.body_from_lab)
-    margin_px = GATE_SIGMAS * (common_px + float(individual_px.max()))
-    visible = np.flatnonzero(prior.camera.contains(predicted, -margin_px))
-    detected = frame.lights.xy_px
-    if not len(visible) or not len(detected):
-        return Correspondences(*np.zeros((2, 0), np.int64))
-    predicted = predicted[visible]
-    individual_px = individual_px[visible]
-    shift = common_shift_px(
-        detected, predicted, common_px, individual_px, prior.camera.center_px
-    )
-    light, led = assign_lights(detected, predicted + shift, GATE_SIGMAS * individual_px)
-    return Correspondences(light, visible[led])
+    return match_by_survey(frame, prior, individual_px, common_px)
 
 
 def common_shift_px(
@@ -550,7 +538,7 @@ def assign_lights(
 
     It minimizes the sum of min(distance / gate, 1)^2. Pairs beyond their gate are left out.
     """
-    distance = np.linalg.norm(detected_px[:, None] - predicted_px, axis=2) / gate_px
+    distance = lengths(detected_px[:, None] - predicted_px) / gate_px
     # Clipping at the gate keeps detections without a counterpart from pulling the other pairs apart.
     rows, column = linear_sum_assignment(np.minimum(distance, 1.0) ** 2)
     inside = distance[rows, column] < 1
@@ -558,20 +546,29 @@ def assign_lights(
 
 
 def match_by_survey(
-    frame: SurveyFrame, prior: CalibrationPrior, sigma_px: Floats
+    frame: SurveyFrame,
+    prior: CalibrationPrior,
+    sigma_px: Floats,
+    common_px: float | None = None,
 ) -> Correspondences:
-    """Match detections to LEDs with the attitudes and map of an adjustment.
+    """Match detections to LEDs with the attitudes and map of an adjustment, or of a prior.
 
     Parameters
     ----------
     sigma_px
         (N,) standard deviation of each LED's predicted coordinates
+    common_px
+        Standard deviation of a shift of all of them, which is then found first
     """
     predicted = prior.pixels(frame.body_from_lab)
-    visible = np.flatnonzero(
-        prior.camera.contains(predicted, -GATE_SIGMAS * float(sigma_px.max()))
-    )
-    light, led = assign_lights(
-        frame.lights.xy_px, predicted[visible], GATE_SIGMAS * sigma_px[visible]
-    )
+    margin_px = GATE_SIGMAS * ((common_px or 0.0) + float(sigma_px.max()))
+    visible = np.flatnonzero(prior.camera.contains(predicted, -margin_px))
+    predicted = predicted[visible]
+    sigma_px = sigma_px[visible]
+    detected = frame.lights.xy_px
+    if common_px is not None and len(visible) and len(detected):
+        predicted = predicted + common_shift_px(
+            detected, predicted, common_px, sigma_px, prior.camera.center_px
+        )
+    light, led = assign_lights(detected, predicted, GATE_SIGMAS * sigma_px)
     return Correspondences(light, visible[led])

@@ -148,9 +148,7 @@ def write_attitudes(
     angles = ([f"{angle:.4f}" for angle in column] for column in euler_deg(lab_from_body).T)
     columns = {**dict(zip(COLUMNS, (names, *angles), strict=True)), **more}
     rows = (columns, *zip(*columns.values(), strict=True))
-    with files.atomic_file(path) as temporary:
-        lines = [",".join(map(str, row)) for row in rows]
-        temporary.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    files.write_text(path, "".join(f"{','.join(map(str, row))}\n" for row in rows))
 
 
 def write_solved(path: Path, rows: Sequence[Record]) -> None:

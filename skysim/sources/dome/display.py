@@ -29,7 +29,7 @@ from skysim.sources.dome.led import (
     strength_factors,
 )
 from skysim.sources.dome.surface import Plane, Surface
-from skysim.sources.photometry import SUN, Band, star_chromatic, star_flux_e_s_m2
+from skysim.sources.photometry import SUN, Band, Reals, star_chromatic, star_flux_e_s_m2
 
 PanelConfig = layouts.LcdConfig | layouts.ProjectorConfig
 
@@ -211,9 +211,9 @@ def block_sources(
     blocks: PixelBlocks,
     place_m: Floats,
     surface: Surface,
-    radius_m: Floats | float,
-    row: Floats | float = 0.0,
-    gain: Floats | float = 1.0,
+    radius_m: Reals,
+    row: Reals = 0.0,
+    gain: Reals = 1.0,
 ) -> Sources:
     """The M blocks as sources, each with n^2 times the light of a pixel.
 

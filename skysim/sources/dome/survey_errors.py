@@ -13,7 +13,8 @@ from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, azimuths_rad, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.tracker import SurveyErrorsConfig, TotalStationConfig
-from skysim.sources.dome.surface import Surface
+from skysim.sources.dome.surface import Surface, directions
+from skysim.sources.stars import axes_about_z
 
 # A total station measures a horizontal direction, a zenith angle and a distance to each LED. The station at s sees an
 # LED at p = s + D u, with the distance D and the unit vector u of the direction H and the zenith angle V. Each LED has
@@ -60,20 +61,6 @@ def polar(config: TotalStationConfig, place_m: Floats) -> tuple[Floats, Floats, 
         azimuths_rad(sight_m),
         np.arctan2(level_m, sight_m[:, 2]),
         distance_m,
-    )
-
-
-def axes(direction_rad: Floats, zenith_rad: Floats) -> tuple[Floats, Floats, Floats]:
-    """Unit vectors u along the sight, v toward greater zenith angles, h toward greater directions, (N, 3) each."""
-    cos_h = np.cos(direction_rad)
-    sin_h = np.sin(direction_rad)
-    zero = np.zeros(len(direction_rad))
-    cos_v = np.cos(zenith_rad)
-    sin_v = np.sin(zenith_rad)
-    return (
-        np.column_stack([sin_v * cos_h, sin_v * sin_h, cos_v]),
-        np.column_stack([cos_v * cos_h, cos_v * sin_h, -sin_v]),
-        np.column_stack([-sin_h, cos_h, zero]),
     )
 
 
@@ -134,19 +121,22 @@ def surveyed_m(
         + scaled_errors(config.distance_sigma_m, own[:, 2])
     )
     # 2.
-    along, _, _ = axes(direction_rad + angles_rad[:, 0], zenith_rad + angles_rad[:, 1])
+    along = directions(zenith_rad + angles_rad[:, 1], direction_rad + angles_rad[:, 0])
     return moved_m(config, np.array(config.position_m) + distance_m[:, None] * along, setup)
 
 
 def station_covariance_m2(config: TotalStationConfig, place_m: Floats) -> Floats:
-    """(N, 3, 3) covariances of the LEDs' own errors: sigma_D^2 u u' + (D sigma_A)^2 (v v' + sin^2 V h h')."""
+    """(N, 3, 3) covariances of the LEDs' own errors: sigma_D^2 u u' + (D sigma_A)^2 (v v' + sin^2 V h h').
+
+    u is along the sight, v toward the zenith, h toward greater directions.
+    """
     direction_rad, zenith_rad, distance_m = polar(config, place_m)
-    along, down, across = axes(direction_rad, zenith_rad)
+    across, up, along = axes_about_z(direction_rad, np.cos(zenith_rad), np.sin(zenith_rad))
     angle_rad = ARCSEC_RAD * float(config.angle_sigma_arcsec)
     scaled = np.stack(
         [
             float(config.distance_sigma_m) * along,
-            (distance_m * angle_rad)[:, None] * down,
+            (distance_m * angle_rad)[:, None] * up,
             (distance_m * np.sin(zenith_rad) * angle_rad)[:, None] * across,
         ]
     )
