@@ -156,7 +156,7 @@ def path(
     for _ in range(3):
         to_m = gcrs_states([one], time, after_s - delay_s)[0][0] - from_m
         delay_s = lengths(to_m) / SPEED_OF_LIGHT_M_S
-    range_m = np.linalg.norm(to_m, axis=1, keepdims=True)
+    range_m = lengths(to_m)[:, None]
     # 3. Aberration; lengths keep the ratios of the ranges, so that the path is that of a place in space.
     own_m_s = np.array([state.velocity_m_s for state in states])
     toward = to_m / range_m + own_m_s / SPEED_OF_LIGHT_M_S

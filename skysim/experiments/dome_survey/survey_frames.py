@@ -538,7 +538,7 @@ def assign_lights(
 
     It minimizes the sum of min(distance / gate, 1)^2. Pairs beyond their gate are left out.
     """
-    distance = np.linalg.norm(detected_px[:, None] - predicted_px, axis=2) / gate_px
+    distance = lengths(detected_px[:, None] - predicted_px) / gate_px
     # Clipping at the gate keeps detections without a counterpart from pulling the other pairs apart.
     rows, column = linear_sum_assignment(np.minimum(distance, 1.0) ** 2)
     inside = distance[rows, column] < 1

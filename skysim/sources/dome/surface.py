@@ -139,7 +139,7 @@ class Surface(ABC):
         # Rings of equal steps in z have equal solid angles.
         min_z = np.cos(min(self.rim.half_rad, np.pi / 2))
         ring_z = 1 - (np.arange(RINGS) + 0.5) / RINGS * (1 - min_z)
-        sectors = np.arange(SECTORS) * (2 * np.pi / SECTORS)
+        sectors = circle_rad(SECTORS)
         rays = unit_vectors(ring_z[:, None], sectors).reshape(-1, 3)
         # Keep the rays that meet the surface within its rim.
         met = self.meet(np.zeros(3), self.lab_from_own.apply(rays))
@@ -152,6 +152,11 @@ class Surface(ABC):
     def as_ellipsoid(self) -> tuple[Floats, Floats]:
         """Center and semi-axes of the ellipsoid that estimators use, (3,) each in m: `nearest_ellipsoid`."""
         return self.nearest_ellipsoid()[:2]
+
+
+def circle_rad(count: int) -> Floats:
+    """(N,) azimuths all around, evenly spaced from 0."""
+    return np.arange(count, dtype=float) * (2 * np.pi / count)
 
 
 def unit_vectors(z: Array, azimuth: Array) -> Floats:
@@ -320,7 +325,7 @@ class Radial(Surface):
 
     def level_and_gradient(self, own_m: Floats) -> tuple[Floats, Floats]:
         """(N,) level f = |x| - r and (N, 3) its gradient x/|x| - (grad r less its part along x) / |x|."""
-        distance_m = np.linalg.norm(own_m, axis=1, keepdims=True)
+        distance_m = lengths(own_m)[:, None]
         # The least positive number avoids 0 / 0 at the center.
         distance_m = np.where(distance_m > 0, distance_m, np.finfo(float).tiny)
         unit = own_m / distance_m
@@ -535,7 +540,7 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     node, weight = np.polynomial.legendre.leggauss(AREA_RINGS)
     least = np.cos(np.radians(cap_deg))
     cosine = (1 + least) / 2 + (1 - least) / 2 * node
-    azimuth = np.arange(AREA_SECTORS) * (2 * np.pi / AREA_SECTORS)
+    azimuth = circle_rad(AREA_SECTORS)
     rays = unit_vectors(cosine[:, None], azimuth).reshape(-1, 3)
     place_m = surface.meet(np.zeros(3), rays)
     met = np.isfinite(place_m[:, 0])

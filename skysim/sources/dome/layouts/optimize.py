@@ -27,7 +27,7 @@ from scipy.spatial.transform import Rotation
 
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints, around_z
+from skysim.core.types import Floats, Ints, around_z, lengths
 from skysim.scene.sections.layouts import OptimizedConfig
 from skysim.sources.dome.layouts.ambiguity import Ambiguity, field_ambiguity
 from skysim.sources.dome.layouts.fisher import (
@@ -466,7 +466,7 @@ def reduce_ambiguity(
         nearby = tree.query(place_m[moved], k=min(NEARBY_SITES, len(sites_m)))[1]
         trial_m = place_m.copy()
         trial_m[moved] = sites_m[rng.choice(nearby)]
-        distance_m = np.linalg.norm(place_m - trial_m[moved], axis=1)
+        distance_m = lengths(place_m - trial_m[moved])
         if np.delete(distance_m, moved).min() < config.spacing_m:
             continue
         # 2.

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints, Sources, normalized, polar_rad
+from skysim.core.types import Floats, Ints, Sources, lengths, normalized, polar_rad
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.ambiguity import unique_levels
@@ -23,7 +23,7 @@ from skysim.sources.dome.led import (
     full_strength_e_s_sr,
     strength_factors,
 )
-from skysim.sources.dome.surface import Surface, directions, unit_vectors
+from skysim.sources.dome.surface import Surface, circle_rad, directions, unit_vectors
 from skysim.sources.photometry import NODES, Band
 
 MAX_CELLS = 500  # along each side of the square in which `thin` lists sites
@@ -156,7 +156,7 @@ tilts_rad = polar_rad  # of places or directions from the zenith, seen from the 
 def check_cap(keys: Sequence[str], directions: Floats, cap_deg: float) -> None:
     """Raise InputError for the first of (N, 3) directions from the bearing that is outside the cap."""
     # Written so that NaN is outside.
-    length = np.linalg.norm(directions, axis=1)
+    length = lengths(directions)
     tilt_deg = np.degrees(tilts_rad(directions))
     beyond = np.flatnonzero(~((length > 0) & (tilt_deg <= cap_deg * (1 + 1e-12))))
     if len(beyond):
@@ -182,7 +182,7 @@ def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
 def largest_cap_deg(surface: Surface) -> float:
     """Greatest angle from the zenith, seen from the bearing, to which the surface extends at every azimuth, to 0.1."""
     tilt_deg = np.arange(0, 1800) / 10
-    azimuth_rad = np.arange(72) * (2 * np.pi / 72)
+    azimuth_rad = circle_rad(72)
     rays = directions(np.radians(tilt_deg)[:, None], azimuth_rad)
     missed = np.isnan(surface.meet(np.zeros(3), rays.reshape(-1, 3))).reshape(rays.shape)
     met = np.logical_and.accumulate(~missed.any(axis=(1, 2)))

@@ -27,7 +27,7 @@ from skysim.sources.dome.layouts.placing import (
     thin,
     tilts_rad,
 )
-from skysim.sources.dome.surface import Surface, directions
+from skysim.sources.dome.surface import Surface, circle_rad, directions
 
 # Random points per spacing^2: a gap of .03 of that area is found with probability .95.
 DARTS_PER_SPACING2 = 100
@@ -196,7 +196,7 @@ def icosahedron() -> Floats:
     """(12, 3) unit vectors: the zenith, five at z = 1 / sqrt 5, five at -1 / sqrt 5 between them, the nadir."""
     z = 1 / np.sqrt(5)
     ring = 2 / np.sqrt(5)
-    azimuth = np.arange(5) * (2 * np.pi / 5)
+    azimuth = circle_rad(5)
     upper = around_z(ring, azimuth, z)
     lower = around_z(ring, azimuth + np.pi / 5, -z)
     return np.vstack([[0.0, 0.0, 1.0], upper, lower, [0.0, 0.0, -1.0]])

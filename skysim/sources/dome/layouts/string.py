@@ -26,7 +26,7 @@ from skysim.core.types import UP, Floats, Ints, Sources, lengths, normalized
 from skysim.core.units import scaled_errors
 from skysim.scene.sections.layouts import AimingConfig, FibersConfig, StringConfig
 from skysim.sources.dome.layouts.placing import project_from_bearing
-from skysim.sources.dome.surface import Surface, directions, perpendicular
+from skysim.sources.dome.surface import Surface, circle_rad, directions, perpendicular
 
 STEPS_PER_TURN = 720
 STEPS_PER_PITCH = 16
@@ -148,12 +148,12 @@ def aside(surface: Surface, tape: Tape, at_m: Floats, sideways_m: Floats) -> Flo
 def mean_meridian(surface: Surface, half_rad: float) -> Meridian:
     """The surface's mean meridian over the cap. Raises InputError if the cap exceeds the surface."""
     tilt_rad = np.linspace(0, half_rad, MERIDIAN_STEPS + 1)
-    azimuth_rad = np.arange(MERIDIANS) * (2 * np.pi / MERIDIANS)
+    azimuth_rad = circle_rad(MERIDIANS)
     rays = directions(tilt_rad[:, None], azimuth_rad)
     place_m = project_from_bearing(surface, rays.reshape(-1, 3)).reshape(rays.shape)
     # Chords along the meridians and around the circles.
-    step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=2).mean(axis=1)
-    around_m = np.linalg.norm(place_m - np.roll(place_m, 1, axis=1), axis=2).sum(axis=1)
+    step_m = lengths(np.diff(place_m, axis=0)).mean(axis=1)
+    around_m = lengths(place_m - np.roll(place_m, 1, axis=1)).sum(axis=1)
     return Meridian(tilt_rad, np.append(0, np.cumsum(step_m)), around_m / (2 * np.pi))
 
 
