@@ -82,22 +82,6 @@ class HeldFrames:
         return origins, lab_from_body.apply(rays_body)
 
 
-@frozen
-class StrayLight:
-    """A light at rest in the lab where no LED is expected.
-
-    Attributes
-    ----------
-    position_m
-        (3,) position in the lab
-    frames
-        Number of frames that show it
-    """
-
-    position_m: Floats
-    frames: int
-
-
 def dark(shown: Bools, seen: Bools) -> Ints:
     """Return the rows of the LEDs that never shine: seen in none of the n frames that must show them.
 
@@ -186,8 +170,8 @@ def _limit(count: int) -> float:
 
 def stray_lights(
     held: HeldFrames, frame: Ints, xy_px: Floats, sigma_px: float, reach_m: float
-) -> list[StrayLight]:
-    """Return the lights at rest among those that are no known LED.
+) -> list[Floats]:
+    """Return the (3,) positions in the lab of the lights at rest among those that are no known LED.
 
     1. Intersect each ray with the assumed surface.
     2. Group the points that are within `reach_m` of one another.
@@ -227,9 +211,8 @@ def stray_lights(
             continue
         # 4. Number of frames
         near = _off_rad(place_m, origins[rows], directions[rows]) < GATE * sigma_rad
-        count = len(np.unique(frame[rows[near]]))
-        if count >= MIN_FRAMES:
-            out.append(StrayLight(place_m, count))
+        if len(np.unique(frame[rows[near]])) >= MIN_FRAMES:
+            out.append(place_m)
     return out
 
 
@@ -271,7 +254,7 @@ def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
 
 
 def name_strays(
-    strays: list[StrayLight], candidates: Ints, list_m: Floats, limit_m: float
+    strays: list[Floats], candidates: Ints, list_m: Floats, limit_m: float
 ) -> list[tuple[int, int]]:
     """Return pairs (LED, stray) of LEDs that are not at their place in the list, and the lights that they may be.
 
@@ -288,8 +271,7 @@ def name_strays(
     """
     if not strays or not len(candidates):
         return []
-    places_m = np.array([stray.position_m for stray in strays])
-    distance_m = np.linalg.norm(list_m[candidates][:, None] - places_m, axis=2)
+    distance_m = np.linalg.norm(list_m[candidates][:, None] - np.array(strays), axis=2)
     rows, columns = linear_sum_assignment(np.minimum(distance_m, limit_m) ** 2)
     inside = distance_m[rows, columns] < limit_m
     leds = candidates[rows[inside]].tolist()

@@ -291,7 +291,7 @@ def displaced_leds(run: SurveyRun) -> dict[int, Floats]:
     named = survey_faults.name_strays(
         strays, missing, run.listed.position_m, MAX_DISPLACEMENT_M
     )
-    return places | {led: strays[k].position_m for led, k in named}
+    return places | {led: strays[k] for led, k in named}
 
 
 def with_places(run: SurveyRun, places: dict[int, Floats]) -> SurveyRun:

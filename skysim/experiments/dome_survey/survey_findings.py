@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import survey_faults, survey_plan
 from estimator.calibration.dome_survey import DomeSurvey
-from estimator.calibration.survey_faults import LightTable, StrayLight
+from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths
 from skysim.experiments.dome_survey.survey_frames import (
@@ -126,7 +126,7 @@ def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
     return out
 
 
-def stray_lights(run: SurveyRun) -> list[StrayLight]:
+def stray_lights(run: SurveyRun) -> list[Floats]:
     """Lights at rest in the lab that are not a known LED."""
     number = [np.zeros(0, np.int64)]
     xy_px = [np.zeros((0, 2))]
@@ -307,7 +307,7 @@ def find_faults(run: SurveyRun) -> Record:
             int(leds.id[row]): survey.leds.position_m[row].tolist()
             for row in (*rows, *(x.led for x in exchanges))
         },
-        "unlisted": [stray.position_m.tolist() for stray in stray_lights(run)],
+        "unlisted": [place_m.tolist() for place_m in stray_lights(run)],
         "exchange_share": share,
     }
 

@@ -17,7 +17,7 @@ from estimator.calibration import (
     survey_plan,
     survey_subset,
 )
-from estimator.calibration.survey_faults import HeldFrames, LightTable, StrayLight
+from estimator.calibration.survey_faults import HeldFrames, LightTable
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from estimator.core.camera import Camera
 from tests.helpers.laws import SEEDS, answered, law
@@ -185,7 +185,7 @@ def test_a_stationary_light_is_found_and_a_defective_pixel_is_not(
     strays = survey_faults.stray_lights(
         frames, rows, np.vstack([xy_px[frame], hot]), 0.1, 0.004
     )
-    near = [stray for stray in strays if np.linalg.norm(stray.position_m - place_m) < 2e-3]
+    near = [stray for stray in strays if np.linalg.norm(stray - place_m) < 2e-3]
     assert len(near) == (len(frame) >= survey_faults.MIN_FRAMES)
     assert survey_faults.stray_lights(frames, rows[:0], hot[:0], 0.1, 0.004) == []
 
@@ -197,7 +197,7 @@ def test_stray_lights_are_named_by_the_nearest_positions(
 ) -> None:
     listed = 10 * rng.normal(0, 1, (8, 3))
     chosen = rng.permutation(8)[:count]
-    strays = [StrayLight(listed[k] + 0.001 * rng.normal(0, 1, 3), 3) for k in chosen]
+    strays = [listed[k] + 0.001 * rng.normal(0, 1, 3) for k in chosen]
     pairs = survey_faults.name_strays(strays, np.arange(8), listed, 0.1)
     assert sorted(pairs) == sorted((int(k), n) for n, k in enumerate(chosen))
     assert survey_faults.name_strays(strays, np.arange(0), listed, 0.1) == []
