@@ -156,7 +156,7 @@ class Surface(ABC):
 
 def circle_rad(count: int) -> Floats:
     """(N,) azimuths all around, evenly spaced from 0."""
-    return np.arange(count) * (2 * np.pi / count)
+    return np.arange(count, dtype=float) * (2 * np.pi / count)
 
 
 def unit_vectors(z: Array, azimuth: Array) -> Floats:
