@@ -19,8 +19,7 @@ The steps of `evaluate`; the same numbers return as comments in the code:
 
 1. Match each detection to its nearest star (`_match`).
 2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).
-3. Match again, with the gates of the detections alone, and reject the candidate if an upper bound of its evidence is
-   too low (`_evidence` without residuals).
+3. Match again, with the gates of the detections alone, and reject a candidate of too little evidence without residuals.
 4. Fit and match once more, unless the fit has converged.
 5. Compute the evidence (`_evidence`), and count the missing stars (`_count_missing`).
 """
@@ -43,19 +42,15 @@ from estimator.catalog.sky_index import (
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
-from estimator.core.least_squares import CONVERGED_CHI2
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex
 from estimator.identification.star_detections import Detections, field_area, gates_of, ray
 
-# Fraction of stars whose magnitude disagrees with the catalog: variable stars, doubles, an unusual passband.
-MAG_OUTLIER_FRACTION = 0.05
+MAG_OUTLIER_FRACTION = 0.05  # of stars: variables, doubles, an unusual passband
 # Penalty for each detection brighter than the faintest match that is unmatched, in excess of the number of matches.
 UNMATCHED_PENALTY_DEX = 0.5
 UNMATCHED_SHARE = 0.5  # of the evidence that this penalty takes at most
-# Greatest difference of the focal length from the assumed one, in units of its uncertainty.
-FOCAL_MARGIN = 1.2
-# Fraction of the field in which an unmatched star counts as missing; nearer to the border it may be cut off.
-INNER_FRACTION = 0.97
+FOCAL_MARGIN = 1.2  # greatest error of the focal length, in units of its uncertainty
+INNER_FRACTION = 0.97  # of the field, where an unmatched star is missing and not cut off
 
 
 class Hypothesis(NamedTuple):
@@ -173,14 +168,14 @@ def evaluate(
                 return no_hypothesis()
         # A fit that has converged on the same matches need not be repeated.
         same = np.array_equal(observed, before[0]) and np.array_equal(star, before[1])
-        if same and fall < CONVERGED_CHI2:
+        if same and fall < least_squares.CONVERGED_CHI2:
             break
         # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
         if n < 2:
             focal_ratio, fall = _fit(detections, sky, R, focal_ratio, observed, star, info)
             if abs(focal_ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty + 1e-12:
                 return no_hypothesis()
-            if n == 1 and fall < CONVERGED_CHI2:
+            if n == 1 and fall < least_squares.CONVERGED_CHI2:
                 break
     # 5. The evidence, with residuals: a literal True would be compiled as another type.
     dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, n > 0)

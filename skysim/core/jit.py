@@ -21,16 +21,16 @@ jit = partial(
 class CompilationNotice(event.Listener):
     """Listener that prints a note at the first compilation; functions from numba's cache are not compiled."""
 
-    told = False
+    printed = False
 
     def on_start(self, _: event.Event) -> None:
         """Called by numba before it compiles a function."""
         # It stays registered: if a listener leaves while numba calls them in turn, numba skips the next.
-        if not self.told:
+        if not self.printed:
             errors.note(
                 "compiling numba functions (once after an installation or update): about a minute"
             )
-        self.told = True
+        self.printed = True
 
     def on_end(self, _: event.Event) -> None:
         """Required by the interface; prints nothing."""

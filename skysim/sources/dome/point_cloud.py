@@ -319,7 +319,7 @@ def fit(points_m: Floats, degree: int, file: str) -> SurfaceFit:
         ) from None
     # 2.
     relative_m = points_m - sphere.center_m
-    radius_m = lengths(relative_m)
+    radius_m = np.linalg.norm(relative_m, axis=1)
     unit = relative_m / radius_m[:, None]
     cover_rad, half_rad = covered_rad(unit)
     # 3.

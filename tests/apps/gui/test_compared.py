@@ -17,7 +17,7 @@ import pytest
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
 from skysim.apps.gui.messages import FlightRow
-from skysim.apps.gui.page.run_panel import KeptRun, flight_table, told, with_kept
+from skysim.apps.gui.page.run_panel import KeptRun, description, flight_table, with_kept
 from skysim.apps.gui.page.strips import Strip, same_times, strips
 from skysim.apps.gui.views.context import PageView
 from skysim.apps.gui.worker.tasks import Worker
@@ -82,7 +82,7 @@ def test_no_difference_is_drawn_without_common_frames_or_reference() -> None:
 def test_both_flights_are_in_one_file_with_their_names() -> None:
     dome = loader.load("afit_simsat", {})
     sky = loader.load("shefex2", {})
-    shown = told(PageView("shefex2", {"seed": "2"}), rows([0.5], [4.0], [1.0]))
+    shown = description(PageView("shefex2", {"seed": "2"}), rows([0.5], [4.0], [1.0]))
     kept = KeptRun(shown, sky, rows([0.5], [4.0], [1.0]), [], 1.0)
     own = flight_table(rows([0.1, 0.2], [3.0, math.nan], [1.0, math.nan]), dome)
     table = with_kept(own, "afit_simsat", kept)
@@ -95,7 +95,9 @@ def test_both_flights_are_in_one_file_with_their_names() -> None:
 
 def test_a_flight_s_description_has_its_command_and_its_record_s_numbers() -> None:
     view = PageView("two_heads", {"exposure.time": "2 ms"}, head="side")
-    found = told(view, rows([0.1, 0.2, 0.3], [3.0, math.nan, 5.0], [-1.0, math.nan, 2.0]))
+    found = description(
+        view, rows([0.1, 0.2, 0.3], [3.0, math.nan, 5.0], [-1.0, math.nan, 2.0])
+    )
     assert found["name"] == "two_heads, exposure.time=2 ms, camera side"
     assert shlex.split(found["command"]) == [
         *("skysim", "run", "two_heads"),
@@ -105,7 +107,7 @@ def test_a_flight_s_description_has_its_command_and_its_record_s_numbers() -> No
     assert [run[key] for key in ("frames", "solved", "wrong")] == [3, 2, 0]
     assert run["cross_arcsec_median"] == np.median([3.0, 5.0])
     assert run["roll_arcsec_median"] == np.median([1.0, 2.0])
-    assert told(view, ())["run"] is None
+    assert description(view, ())["run"] is None
 
 
 def flown(worker: Worker) -> list[FlightRow]:

@@ -51,7 +51,7 @@ class Comparison(ui.element, component="js/compared.js"):  # type: ignore[call-a
 
 
 class KeptRun(NamedTuple):
-    """A flight to which others are compared: its description (`told`), scene, rows, strips, and their end."""
+    """A flight to which others are compared: its `description`, scene, rows, strips, and their end."""
 
     shown: Record
     scene: Scene
@@ -74,7 +74,7 @@ class RunPanel:
     reference
         The flight that is kept for comparison, if any; another scene does not empty it
     computing, stopping
-        Whether the flight is being computed, and whether the computation has been told to stop
+        Whether the flight is being computed, and whether the computation must stop
     playing, showing
         Whether it plays, and whether `play_on` shows its frames
     slot
@@ -331,7 +331,7 @@ class RunPanel:
         """Keep this flight, to which the next ones are compared."""
         info = self.page.scene_info
         assert info is not None
-        shown = told(self.page.state, self.rows)
+        shown = description(self.page.state, self.rows)
         drawn = strips(self.rows, self.log)
         kept = KeptRun(shown, info.scene, self.rows, drawn, self.end_s)
         await self.page.ask("keep_flight", True)
@@ -348,7 +348,7 @@ class RunPanel:
         """Show how this flight differs from the reference."""
         shown: list[object] = []
         if self.reference:
-            own = told(self.page.state, self.rows if self.other_run else ())
+            own = description(self.page.state, self.rows if self.other_run else ())
             pairs = same_times(self.rows, self.reference.rows)
             shown += [own, self.reference.shown, len(pairs)]
         self.comparison.run_method("show", *shown)
@@ -501,7 +501,7 @@ def nearest(rows: Sequence[FlightRow], t_s: float) -> int:
     return min(range(len(rows)), key=lambda n: abs(TIME_S(rows[n]) - t_s))
 
 
-def told(view: PageView, rows: Sequence[FlightRow]) -> Record:
+def description(view: PageView, rows: Sequence[FlightRow]) -> Record:
     """A flight's name, its command, and what `skysim run --json` prints of its frames, if there are any."""
     return {
         "name": view.name,

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import field
+from functools import partial
 from operator import attrgetter
 
 import numpy as np
@@ -75,46 +76,13 @@ def strips(
     reference
         Rows of another flight, from which the errors are subtracted where frames have the same time
     """
-    pairs = same_times(rows, reference)
-
-    def of_frames(
-        name: str, field: str, kind: str = "line", factor: int = 1, least: float = -math.inf
-    ) -> StripCurve:
-        found = ((one.row.t_s, factor * attrgetter(field)(one)) for one in rows)
-        points = [point(t_s, max(value, least)) for t_s, value in found if value == value]
-        return StripCurve(name, points, kind)
-
-    def change(name: str, field: str) -> StripCurve:
-        error = attrgetter(field)
-        found = ((row.t_s, error(row) - error(old)) for row, old in pairs)
-        return StripCurve(
-            name, [point(t_s, value) for t_s, value in found if value == value], "dots"
-        )
+    of_frames = partial(frame_curve, rows)
 
     def of_motion(name: str) -> StripCurve:
         return StripCurve(name, [*map(point, log.get("t_s", ()), log.get(name, ()))])
 
     found = [
-        Strip(
-            "cross-boresight error, ″",
-            (
-                of_frames("tracker", "row.cross_arcsec", "dots", least=FLOOR),
-                of_frames("3σ", "row.cross_sigma_arcsec", "band", 3),
-            ),
-            logarithmic=True,
-        ),
-        Strip(
-            "roll error, ″",
-            (
-                of_frames("tracker", "row.roll_arcsec", "dots"),
-                of_frames("−3σ", "row.roll_sigma_arcsec", "band", -3),
-                of_frames("+3σ", "row.roll_sigma_arcsec", "band", 3),
-            ),
-        ),
-        Strip(
-            "error minus that of the reference, ″",
-            (change("cross", "cross_arcsec"), change("roll", "roll_arcsec")),
-        ),
+        *error_strips(rows, same_times(rows, reference)),
         Strip(
             "attitude error, ″",
             (
@@ -135,6 +103,61 @@ def strips(
         Strip("momentum, N m s", (of_motion("momentum"),)),
     ]
     return [one for one in found if one.dots or any(curve.points for curve in one.curves)]
+
+
+def error_strips(
+    rows: Sequence[FlightRow], pairs: Sequence[tuple[FrameRow, FrameRow]]
+) -> list[Strip]:
+    """The errors of each frame with their standard errors, and the changes from another flight's frame."""
+    of_frames = partial(frame_curve, rows)
+    change = partial(change_curve, pairs)
+    return [
+        Strip(
+            "cross-boresight error, ″",
+            (
+                of_frames("tracker", "row.cross_arcsec", "dots", least=FLOOR),
+                of_frames("3σ", "row.cross_sigma_arcsec", "band", 3),
+            ),
+            logarithmic=True,
+        ),
+        Strip(
+            "roll error, ″",
+            (
+                of_frames("tracker", "row.roll_arcsec", "dots"),
+                of_frames("−3σ", "row.roll_sigma_arcsec", "band", -3),
+                of_frames("+3σ", "row.roll_sigma_arcsec", "band", 3),
+            ),
+        ),
+        Strip(
+            "error minus that of the reference, ″",
+            (change("cross", "cross_arcsec"), change("roll", "roll_arcsec")),
+        ),
+    ]
+
+
+def frame_curve(
+    rows: Sequence[FlightRow],
+    name: str,
+    field: str,
+    kind: str = "line",
+    factor: int = 1,
+    least: float = -math.inf,
+) -> StripCurve:
+    """A number of each frame by its time, times a factor, and at least a lower limit."""
+    found = ((one.row.t_s, factor * attrgetter(field)(one)) for one in rows)
+    points = [point(t_s, max(value, least)) for t_s, value in found if value == value]
+    return StripCurve(name, points, kind)
+
+
+def change_curve(
+    pairs: Sequence[tuple[FrameRow, FrameRow]], name: str, field: str
+) -> StripCurve:
+    """By how much a number of a frame exceeds that of the other flight's frame of the same time."""
+    error = attrgetter(field)
+    found = ((row.t_s, error(row) - error(old)) for row, old in pairs)
+    return StripCurve(
+        name, [point(t_s, value) for t_s, value in found if value == value], "dots"
+    )
 
 
 def same_times(
