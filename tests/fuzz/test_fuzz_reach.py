@@ -63,7 +63,6 @@ OUT_OF_REACH = {
     "skysim.experiments.study.own_code.digest_of": "the text of the user's own code, which Python has read",
     "skysim.experiments.study.execution.runner.check_functions": "the store is read by `open_store`",
     "skysim.apps.cli.commands.resources.new": SHIPPED,
-    "skysim.sources.catalog.write_selection": "hands the file on to the estimator's `catalog.read`",
     "skysim.core.paths.title_of": "two lines of a file that lies in a folder of ours",
     "skysim.apps.gui.worker.photo.frame_files": "copies a run's files",
     "skysim.apps.gui.page.monte_carlo_panel.MonteCarloPanel.study_file": OURS,

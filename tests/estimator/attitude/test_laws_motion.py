@@ -543,13 +543,13 @@ def test_an_outlier_is_beyond_four_standard_deviations_of_the_noise_that_is_seen
 def test_moments_of_an_ellipse_match_those_of_its_pixels(rng: np.random.Generator) -> None:
     xx, yy = rng.uniform(12, 30, 2)
     xy = rng.uniform(-0.5, 0.5) * np.sqrt(xx * yy)
-    offset = np.stack(np.meshgrid(np.arange(60) - 29.5, np.arange(60) - 29.5), axis=-1)
+    offset = np.stack(np.meshgrid(np.arange(120) - 59.5, np.arange(120) - 59.5), axis=-1)
     distance2 = np.einsum(
         "yxi,ij,yxj->yx", offset, np.linalg.inv([[xx, xy], [xy, yy]]), offset
     )
     # Of a uniform ellipse; its moments are a quarter of the squared half axes.
     inside = distance2 < 4
-    image = np.where(inside, 5000.0, 0.0) + rng.normal(100, 1, (60, 60))
+    image = np.where(inside, 5000.0, 0.0) + rng.normal(100, 1, (120, 120))
     blobs = local(image, 8.0, 50)
     assert len(blobs) == 1
     (found,) = classify.moments(image, blobs)

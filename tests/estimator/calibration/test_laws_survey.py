@@ -12,6 +12,8 @@ from hypothesis import strategies as some
 from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
@@ -562,3 +564,33 @@ def test_a_camera_is_calibrated_by_identified_stars(
     )
     assert (result is not None) == seen
     assert result is None or disagreement_px(result.camera, CAMERA) < 0.5
+
+
+@law(survey_subset.connected_group)
+@given(rng=SEEDS, shared=some.sampled_from([1, 2]))
+def test_a_group_of_frames_is_closed_and_connected(
+    rng: np.random.Generator, shared: int
+) -> None:
+    """With one light to share it is a component of the graph of frames and lights."""
+    visible = rng.random((rng.integers(2, 12), rng.integers(2, 15))) < 0.25
+    frames = len(visible)
+    first = int(rng.integers(frames))
+    group = survey_subset.connected_group(visible, first, shared)
+    assert group[first]
+    # No other frame shares so many lights with the group, and each of the group does with those before it.
+    lights = visible[group].any(axis=0)
+    assert all((visible[~group] & lights).sum(axis=1) < shared)
+    reached = {first}
+    for _ in range(frames):
+        lights = visible[sorted(reached)].any(axis=0)
+        reached |= set(np.flatnonzero((visible & lights).sum(axis=1) >= shared).tolist())
+    assert reached == set(np.flatnonzero(group).tolist())
+    if shared == 1:
+        graph = np.block(
+            [
+                [np.zeros((frames, frames)), visible],
+                [visible.T, np.zeros((visible.shape[1],) * 2)],
+            ]
+        )
+        label = connected_components(csr_array(graph))[1]
+        assert (label[:frames] == label[first]).tolist() == group.tolist()
