@@ -85,6 +85,7 @@ STRAYS = 2
 MOST_STRAYS = 6
 MOST_ALIKE = 40
 MARGIN_DEX = 5.0  # by which the best attitude must beat every other one
+MARGIN_SIGMA = 4.3  # as improbable, in standard deviations on one side
 AMBIGUOUS_DEX = 2.0  # least evidence of the best attitude for a near rival to be reported
 MIN_SEPARATION = (
     1e-9  # of a pair, in tangents: closer detections have no direction between them
@@ -368,15 +369,16 @@ def _better(
 
     Identifications agree if more than half of the matches of the smaller one are also in the other.
 
-    A rival beyond chance is a place that is alike, and the errors of the map may decide between the two. GATE_SIGMA
-    standard deviations of the difference, `LedDetections.blur_dex` times the root of the number of lights that both
-    match, are added to its evidence.
+    A rival beyond chance is a place that is alike, and the errors of the map may decide between the two. The difference
+    must then also exceed MARGIN_SIGMA standard deviations of them: of `LedDetections.blur_dex` times the root of the
+    number of lights that both match.
     """
     both, same = shared_matches(hypothesis, best, len(detections.ray))
     if 2 * same <= min(len(hypothesis.observed), len(best.observed)):
         dex = min(hypothesis.dex, best.dex)
         if dex > ACCEPT_DEX:
-            dex += GATE_SIGMA * detections.blur_dex * sqrt(both)
+            blur_dex = detections.blur_dex * sqrt(both)
+            dex += max(MARGIN_SIGMA * blur_dex - MARGIN_DEX, 0.0)
         rival_dex = max(rival_dex, dex)
     return (hypothesis if hypothesis.dex > best.dex else best), rival_dex
 

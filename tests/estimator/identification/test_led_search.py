@@ -761,13 +761,14 @@ def test_a_like_place_within_the_map_s_errors_is_a_rival() -> None:
     """Two hypotheses of 20 lights, all of other LEDs: beyond chance their difference must exceed its own noise."""
     star = np.arange(20)
     best = led_evidence.LedHypothesis(star, star, np.eye(3), 60.0)
-    detections = SimpleNamespace(ray=np.zeros((20, 3)), blur_dex=2.0)
-    for rival_dex, counted_dex in ((40.0, 40 + 3.5 * 2 * np.sqrt(20)), (4.0, 4.0)):
+    # 4.3 standard deviations of 20 lights are 38.5 powers of ten, of which identify() asks for five, and 3.8.
+    for blur_dex, rival_dex, added_dex in ((2.0, 40.0, 33.46037), (0.2, 40, 0), (2.0, 4.0, 0)):
+        detections = SimpleNamespace(ray=np.zeros((20, 3)), blur_dex=blur_dex)
         rival = led_evidence.LedHypothesis(star, star + 100, np.eye(3), rival_dex)
         for pair in ((rival, best), (best, rival)):
             kept, counted = PLAIN._better(*pair, -np.inf, detections)
             assert kept.dex == 60.0
-            assert counted == pytest.approx(counted_dex, rel=1e-12)
+            assert counted == pytest.approx(rival_dex + added_dex, rel=1e-6)
     agreeing = led_evidence.LedHypothesis(star, star, np.eye(3), 50.0)
     assert PLAIN._better(agreeing, best, -np.inf, detections)[1] == -np.inf
 
