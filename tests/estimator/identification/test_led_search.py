@@ -762,7 +762,11 @@ def test_a_like_place_within_the_map_s_errors_is_a_rival() -> None:
     star = np.arange(20)
     best = led_evidence.LedHypothesis(star, star, np.eye(3), 60.0)
     # 4.3 standard deviations of 20 lights are 38.5 powers of ten, of which identify() asks for five, and 3.8.
-    for blur_dex, rival_dex, added_dex in ((2.0, 40.0, 33.46037), (0.2, 40, 0), (2.0, 4.0, 0)):
+    for blur_dex, rival_dex, added_dex in (
+        (2.0, 40.0, 33.46037),
+        (0.2, 40, 0),
+        (2.0, 4.0, 0),
+    ):
         detections = SimpleNamespace(ray=np.zeros((20, 3)), blur_dex=blur_dex)
         rival = led_evidence.LedHypothesis(star, star + 100, np.eye(3), rival_dex)
         for pair in ((rival, best), (best, rival)):
