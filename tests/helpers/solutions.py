@@ -1,11 +1,20 @@
-"""Solutions of frames without a tracker, for tests of the page."""
+"""Solutions of frames without a tracker, and rows of a flight, for tests of the page."""
 
 import math
 from dataclasses import asdict
 from typing import Any
 
-from skysim.apps.gui.messages import Detection, TrackerResult
+from skysim.apps.gui.messages import Detection, FlightRow, TrackerResult
+from skysim.apps.gui.worker.tasks import Worker
 from skysim.results.scoring import FrameRow
+
+
+def flown(worker: Worker) -> list[FlightRow]:
+    """The rows of the open scene's flight."""
+    steps = [worker.begin_flight()]
+    while not steps[-1].is_done:
+        steps.append(worker.advance_flight(10.0))
+    return [row for step in steps for row in step.rows]
 
 
 def solution(

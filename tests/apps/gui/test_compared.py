@@ -36,7 +36,7 @@ from tests.helpers.labpage import (
     pictured,
     simulate,
 )
-from tests.helpers.solutions import numbers, solution
+from tests.helpers.solutions import flown, numbers, solution
 
 pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
@@ -108,13 +108,6 @@ def test_a_flight_s_description_has_its_command_and_its_record_s_numbers() -> No
     assert run["cross_arcsec_median"] == np.median([3.0, 5.0])
     assert run["roll_arcsec_median"] == np.median([1.0, 2.0])
     assert description(view, ())["run"] is None
-
-
-def flown(worker: Worker) -> list[FlightRow]:
-    steps = [worker.begin_flight()]
-    while not steps[-1].is_done:
-        steps.append(worker.advance_flight(10.0))
-    return [row for step in steps for row in step.rows]
 
 
 @pytest.mark.slow

@@ -10,7 +10,6 @@ import pytest
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
-from skysim.apps.gui.messages import FlightRow
 from skysim.apps.gui.worker.tasks import Worker
 from skysim.results.scoring import Score
 from skysim.scene import loader
@@ -27,17 +26,10 @@ from tests.helpers.labpage import (
     pictured,
     simulate,
 )
-from tests.helpers.solutions import numbers
+from tests.helpers.solutions import flown, numbers
 
 pytest_plugins = ["tests.helpers.labpage"]
 in_browser = pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
-
-
-def flown(worker: Worker) -> list[FlightRow]:
-    steps = [worker.begin_flight()]
-    while not steps[-1].is_done:
-        steps.append(worker.advance_flight(10.0))
-    return [row for step in steps for row in step.rows]
 
 
 @pytest.mark.slow

@@ -20,16 +20,8 @@ from skysim.apps.gui.worker.tasks import Worker
 from skysim.results import scoring
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
-from tests.helpers.solutions import numbers, solution
+from tests.helpers.solutions import flown, numbers, solution
 from tests.test_every_scene import FEWER, NAMES
-
-
-def flown(worker: Worker) -> list[FlightRow]:
-    """The rows of the open scene's flight."""
-    steps = [worker.begin_flight()]
-    while not steps[-1].is_done:
-        steps.append(worker.advance_flight(10.0))
-    return [row for step in steps for row in step.rows]
 
 
 @pytest.mark.slow
