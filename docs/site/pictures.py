@@ -70,8 +70,13 @@ def screenshots() -> None:
         page.wait_for_timeout(3000)  # the first frame clears earlier clicks
         page.get_by_role("tab", name="Lights").click()
         bellatrix = page.locator("tr", has_text="Bellatrix")
+        bellatrix.wait_for()
+        heads = page.locator(".lab-lights th").all_text_contents()
         box, (left, top, scale) = frame_placement(page)
-        x, y = (float(bellatrix.locator("td").nth(column).inner_text()) for column in (3, 4))
+        x, y = (
+            float(bellatrix.locator("td").nth(heads.index(name)).inner_text())
+            for name in ("x, px", "y, px")
+        )
         page.mouse.click(
             box["x"] + left + (x + 0.5) * scale, box["y"] + top + (y + 0.5) * scale
         )
