@@ -18,6 +18,7 @@ the last term that of rounding to whole numbers of gain e-/DN.
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import replace
+from functools import lru_cache
 from math import hypot
 from typing import Any, NamedTuple
 
@@ -92,6 +93,7 @@ class Detector:
     column_offset_e: Singles
 
     @classmethod
+    @lru_cache(maxsize=4)  # laboratories of one process often share a camera
     def from_camera(cls, camera: CameraConfig) -> "Detector":
         """Draw the fixed pattern of a camera's chip; each kind has its own random stream."""
         config = camera.detector

@@ -7,6 +7,7 @@ per star, sorted by number. Directions are in the ICRS.
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import fields, replace
+from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
@@ -284,7 +285,13 @@ def read_for(key: str, name: str) -> Catalog:
     """The stars of the catalog that a scene's key names. Raises InputError that begins with the key."""
     path = require_catalog(key, name)
     with errors_within(key):
-        return read(path)
+        return read_once(path, path.stat().st_mtime_ns)
+
+
+@lru_cache(maxsize=4)
+def read_once(path: Path, changed_ns: int) -> Catalog:
+    """The stars of a file; it is read again only after a change, by its time."""
+    return read(path)
 
 
 def require_catalog(key: str, name: str) -> Path:

@@ -48,7 +48,7 @@ READERS: tuple[Callable[[Path], object], ...] = (
 @pytest.mark.parametrize("key", TEXTS)
 @pytest.mark.parametrize("problem", TEXTS)
 def test_no_message_is_longer_than_a_thousand_characters(key: str, problem: str) -> None:
-    for allowed, file in itertools.product(TEXTS, TEXTS[1:]):
+    for allowed, file in itertools.product(TEXTS, (TEXTS[2], TEXTS[-1])):
         error = InputError(key, problem, allowed, Where(file, 7))
         for one in (
             error,

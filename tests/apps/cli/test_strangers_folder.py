@@ -33,7 +33,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name in NAMES:
         code = f"import posix\nposix.mkdir({str(marks / name)!r})\n"
         (folder / f"{name}.py").write_text(code, encoding="utf-8")
-    (folder / "s.yaml").write_text("schema: 1\nbase: afit_simsat\nexposure: {frames: 2}\n")
+    (folder / "s.yaml").write_text(
+        "schema: 1\nbase: afit_simsat\nexposure: {frames: 2, first: 0.05 s}\n"
+    )
     (folder / "study.yaml").write_text(
         "schema: 1\ntitle: A study\nscene: shefex2\nseed: 1\ntrial: {kind: centroids, noise_px: 0.1}\n"
         "factors:\n  lights: {key: trial.lights, values: [8, 12]}\nreplicates: 3\nresponses: [identified]\n"
