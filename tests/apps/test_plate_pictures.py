@@ -172,6 +172,7 @@ def test_exif_gives_the_field_by_the_diagonal(
     assert math.sqrt(narrow * wide) == pytest.approx(FOV_DEG, rel=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("focal_35mm", [133, 138])
 @pytest.mark.parametrize("orientation", [1, 6])
 def test_both_ways_to_convert_a_focal_length_are_within_its_uncertainty(

@@ -73,6 +73,7 @@ def test_astropy_reads_the_header_to_a_tenth_of_an_arcsecond(
     assert np.linalg.norm(found - expected, axis=1).max() < 0.1 * ARCSEC_RAD
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("aspect", [0.96, 1.04])
 def test_pixels_that_are_not_square_are_fitted_and_noted(
     tmp_path: Path, aspect: float

@@ -431,6 +431,7 @@ def test_a_run_errs_as_check_forecasts(key: str, value: str) -> None:
     assert share.min() > 0.5
 
 
+@pytest.mark.slow
 def test_flares_of_coma_point_outward_in_a_frame() -> None:
     """The third moment of the light along the radius, in proportion to the distance from the principal point."""
     scene = loader.load(

@@ -142,6 +142,7 @@ def test_the_truth_has_the_electrons_that_all_filters_together_pass() -> None:
     )
 
 
+@pytest.mark.slow
 def test_the_tracker_solves_a_color_frame() -> None:
     camera, frame, truth = taken(bayer="BGGR", quantum_efficiency=COLORS)
     found = factory.solve_frame(build_tracker(camera), frame).attitude.cam_from_ref

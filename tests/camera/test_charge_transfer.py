@@ -203,6 +203,7 @@ def clocked_under_light(
     return np.array(store)
 
 
+@pytest.mark.slow
 def test_smear_equals_that_of_a_column_clocked_under_light() -> None:
     exposure_s = 0.05
     row_time_s = 2e-6

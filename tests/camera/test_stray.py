@@ -39,6 +39,7 @@ CAMERA = {
 }
 
 
+@pytest.mark.slow
 def test_the_glow_of_a_uniform_sphere_matches_theory() -> None:
     """Radiance rho E / pi with E = P / (A (1 - rho)), and the cos^4 law; wherever the camera is and looks."""
     wall = Ellipsoid(np.zeros(3), semi_axes_m=np.full(3, 2.0))

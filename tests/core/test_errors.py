@@ -191,6 +191,7 @@ def test_an_error_requires_a_key_and_a_problem() -> None:
     assert not found
 
 
+@pytest.mark.slow
 def test_only_errors_of_the_command_line_mention_it() -> None:
     found = [
         f"{path}:{node.lineno}"

@@ -165,6 +165,7 @@ def test_a_flight_too_long_for_memory_is_refused(overrides: dict[str, str]) -> N
         loader.load("shefex2", overrides)
 
 
+@pytest.mark.slow
 @settings(max_examples=8, deadline=None)
 @given(
     some.dictionaries(some.text(min_size=1, max_size=30), some.text(max_size=30), max_size=3)

@@ -36,6 +36,7 @@ def digests(folder: Path) -> dict[str, str]:
     return {str(path.relative_to(folder)): digest(path) for path in files}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "frames"), [("shefex2", 2), pytest.param("two_heads", 2, marks=pytest.mark.slow)]
 )

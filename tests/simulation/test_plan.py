@@ -958,6 +958,7 @@ def test_forecasts_are_of_the_rate_that_they_state() -> None:
     assert errors[1] > 3 * errors[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("detector", "level", "warned"), [("thesis", 42, 1), ("thesis", 40, 0), ("local", 42, 0)]
 )

@@ -261,6 +261,7 @@ def test_no_optimized_field_shares_half_with_another_while_spiral_fields_nearly_
     assert np.mean(darts.fraction > 0.5) < 0.01  # these are identified
 
 
+@pytest.mark.slow
 def test_too_many_leds_for_their_spacing_are_refused() -> None:
     with pytest.raises(
         InputError, match=r"light.layout.spacing: \d+ of 120 LEDs fit 0.2 m apart"

@@ -10,6 +10,7 @@ import pytest
 from skysim.apps.cli.options import complete_scene, complete_study
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("typed", "completed"),
     [

@@ -219,6 +219,7 @@ def test_an_optional_section_can_be_added_and_removed() -> None:
     assert forms.with_value("shefex2", with_stops, "camera.vignetting.kind", "none") == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2", "simsat_slew"])
 def test_every_offered_kind_gives_a_valid_scene(name: str) -> None:
     fields = [field for field in forms.fields(name, {}) if field.key.endswith(".kind")]

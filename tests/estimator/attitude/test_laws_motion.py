@@ -265,6 +265,7 @@ def test_the_covariance_of_noisy_streaks_is_that_of_their_noise() -> None:
     assert np.mean(factors) == pytest.approx(64, rel=4 * np.sqrt(2 / 7 / 300))
 
 
+@pytest.mark.slow
 @law(rolling.fit)
 @given(rng=SEEDS)
 def test_attitude_and_rate_are_found_together(rng: np.random.Generator) -> None:

@@ -350,6 +350,7 @@ def streaked(
     return frame, places
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("length_px", [12.0, 24.0, 48.0])
 @pytest.mark.parametrize("angle_deg", [63.0, 120.0])
 def test_faint_streaks_are_found_at_full_length(length_px: float, angle_deg: float) -> None:

@@ -142,6 +142,7 @@ def test_hostile_pictures_are_refused(
     assert [line for one in verdicts.values() for line in one.defects] == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("frames", [3, pytest.param(1000, marks=pytest.mark.long)])
 def test_a_mirrored_sky_is_refused(stars: catalog.StarCatalog, frames: int) -> None:
     """The unmirrored sky of each is solved, so only the mirror image is the reason of the refusal."""

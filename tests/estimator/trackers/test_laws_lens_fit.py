@@ -168,6 +168,7 @@ def test_slopes_of_the_distortion_are_difference_quotients(rng: np.random.Genera
         np.testing.assert_allclose(slope, numeric, rtol=0, atol=1e-8)
 
 
+@pytest.mark.slow
 @law(FieldMatcher.with_lens, FieldMatcher.reason_against, slow=True)
 @pytest.mark.parametrize(
     "lens", [one for one in LENSES if "square" not in one.name], ids=lambda one: one.name

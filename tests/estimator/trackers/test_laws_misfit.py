@@ -73,6 +73,7 @@ def test_right_model_keeps_its_covariance(tracker: StarTracker) -> None:
     assert stats.kstest(nees, stats.chi2(3).cdf).pvalue > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "times", [3, *(pytest.param(times, marks=pytest.mark.slow) for times in (2, 5))]
 )

@@ -180,6 +180,7 @@ def test_a_detection_belongs_to_the_brightest_nearby_source_alone() -> None:
     np.testing.assert_array_equal(unmatched, [[80, 80]])
 
 
+@pytest.mark.slow
 def test_particles_are_masked_where_a_frame_without_them_differs() -> None:
     """Both frames have the same photons and the same noise; a count is 10 electrons, and the threshold 15."""
     with_, without = (

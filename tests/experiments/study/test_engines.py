@@ -529,6 +529,7 @@ time.sleep(0.6)
 """
 
 
+@pytest.mark.slow
 def test_ctrl_c_during_the_imports_of_the_workers_prints_nothing_of_theirs() -> None:
     """A terminal sends it to every process of the command."""
     done_ = subprocess.run(

@@ -326,6 +326,7 @@ def forked(does: Callable[[], object]) -> int:
     return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", STEPS)
 def test_a_kill_in_any_step_of_a_move_loses_and_duplicates_no_row(
     step: str, tmp_path: Path

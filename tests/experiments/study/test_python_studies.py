@@ -213,6 +213,7 @@ def test_the_digest_of_a_function_follows_the_user_s_modules(
     assert own_code.digest_of(pilot.solve) != first
 
 
+@pytest.mark.slow
 def test_the_digest_has_the_values_of_closures_and_objects() -> None:
     def with_gain(gain: Any) -> Callable[[Any], Any]:
         return lambda image: gain
