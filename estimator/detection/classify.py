@@ -22,7 +22,7 @@ from math import atan2, cos, hypot, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate
@@ -39,7 +39,7 @@ UNEQUAL_WIDTH = 1.25  # least ratio of the widest to the narrowest letter
 MARGIN = 0.5  # margin around a line of text over the height
 
 
-def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
+def find_captions(boxes: Ints, peak: Floats) -> Bools:
     """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks.
 
     A line of text is a chain of blobs side by side on one base line that are equally high and equally bright, and
@@ -164,9 +164,8 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     """
     if not len(blobs):
         return replace(blobs, streak_px=priors.streak_px)
-    background = blobs.background
     # 1. Shapes
-    shape = _shapes(image, blobs.box_px, background.level, background.noise)
+    shape = _shapes(image, blobs.box_px, *blobs.background)
     # 2. Text, in photographs. Streaks of a known length have boxes of one height, as letters do.
     text = np.zeros(len(blobs), bool)
     streak_px = priors.streak_px
@@ -190,7 +189,7 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         blobs.box_px,
         blobs.xy_px,
         blobs.peak,
-        background.noise,
+        blobs.background.noise,
         image.shape,
         (x, y, turn_rad),
         streak_px is not None,
@@ -213,8 +212,7 @@ def streaks_px(
 
 def moments(image: NDArray, blobs: Blobs) -> Floats:
     """Return the (N, 3) second moments of each blob, px^2: xx - yy, 2 xy and xx + yy."""
-    background = blobs.background
-    _, _, across, x, y = _shapes(image, blobs.box_px, background.level, background.noise).T
+    _, _, across, x, y = _shapes(image, blobs.box_px, *blobs.background).T
     # xx + yy is the sum of the eigenvalues: twice the smaller one, and their difference.
     return np.column_stack([x / 12, y / 12, 2 * across + np.hypot(x, y) / 12])
 

@@ -22,7 +22,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, Ints, native, number, of_type
+from estimator.core.checks import Floats, Ints, Ints32, native, number, of_type
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
@@ -33,7 +33,6 @@ from estimator.detection.background import (
     median,
 )
 from estimator.detection.components import (
-    Ints32,
     accumulate_blobs,
     brightest_blobs,
     label_runs,
@@ -130,7 +129,7 @@ def _classified(
         large = np.any(blobs.area_px >= LARGE_PX)
         if priors.streak_px is not None or stars >= FEW_STARS or large:
             return blobs
-        if is_steep(background.level, background.noise):
+        if is_steep(*background):
             return blobs
         faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
         if len(faint) <= stars + 1:
@@ -393,7 +392,7 @@ def flat_background(image: NDArray) -> Background:
     background = estimate_background(image)
     level = median(background.level)
     noise = median(background.noise)
-    return Background(np.full((1, 1), level), np.full((1, 1), noise), max(image.shape))
+    return Background(np.full((1, 1), level), np.full((1, 1), noise))
 
 
 def detect_blobs(
