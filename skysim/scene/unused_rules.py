@@ -79,14 +79,6 @@ def external(scene: Scene) -> bool:
     return scene.tracker.name != OWN
 
 
-def surface_unused(scene: Scene) -> bool:
-    """Whether a map replaces the surveyed LEDs and the solver does not use the surveyed surface."""
-    tracker = scene.tracker
-    return tracker.map is not None and (
-        external(scene) or tracker.solver not in SURFACE_SOLVERS
-    )
-
-
 def survey_draws_nothing(scene: Scene) -> bool:
     """Whether `tracker.survey.seed` draws no survey error."""
     survey = scene.tracker.survey
@@ -155,12 +147,6 @@ def has_air(scene: Scene) -> bool:
 def seen_from_ground(scene: Scene) -> bool:
     """Whether the view depends on the place on the Earth."""
     return has_air(scene) or (seen_from_earth(scene) and scene.site.longitude_deg is not None)
-
-
-def nothing_beside_the_field(scene: Scene) -> bool:
-    """Whether neither a body nor the lit Earth causes stray light."""
-    lit_earth = scene.orbit is not None and scene.orbit.earth is not None
-    return getattr(scene.light, "bodies", None) is None and not lit_earth
 
 
 # The rules, by section of the scene.
@@ -296,7 +282,10 @@ RULES = (
             "tracker.survey.surface_seed",
             "light.surface.error",
         ),
-        surface_unused,
+        lambda scene: (
+            scene.tracker.map is not None
+            and (external(scene) or scene.tracker.solver not in SURFACE_SOLVERS)
+        ),
         "tracker.map replaces the survey of the LEDs, and the solver does not use the surface",
         f"no tracker.map, or tracker.solver {' or '.join(SURFACE_SOLVERS)}",
     ),
@@ -363,7 +352,9 @@ RULES = (
     ),
     Rule(
         ("camera.baffle",),
-        nothing_beside_the_field,
+        lambda scene: (
+            not (getattr(scene.light, "bodies", None) or (scene.orbit and scene.orbit.earth))
+        ),
         "neither a body nor the lit Earth is in the scene",
         "light.bodies or orbit.earth",
     ),
