@@ -48,6 +48,9 @@ CONVERGED_RAD = 1e-13
 # dp/du, the derivative of a point with respect to its ray u; and by_rotation, (N, 3) derivative of the point's distance
 # along u with respect to the attitude, 0 where the method does not use the attitude to place the point
 Points = tuple[Floats, Floats, Floats, Floats | float]
+Solution = tuple[
+    Rotation, Floats
+]  # body_from_lab, and its (3, 3) covariance in body axes, rad^2
 
 
 def _from_points(
@@ -56,7 +59,7 @@ def _from_points(
     sigma_rad: Floats,
     position_m: Floats,
     body_from_lab: Rotation,
-) -> tuple[Rotation, Floats]:
+) -> Solution:
     """Return body_from_lab and its (3, 3) covariance in body axes, rad^2, from points on the rays, by their directions.
 
     Until the attitude converges (at once, where the points do not depend on it):
@@ -119,7 +122,7 @@ def infinity(
     leds: LedMap,
     lever: Lever,
     body_from_lab: Rotation,
-) -> tuple[Rotation, Floats]:
+) -> Solution:
     """Take the LEDs as infinitely far: solve Wahba's problem with the rays as directions from the bearing center.
 
     This is what a flight tracker does under a dome. The camera is closer to the dome by M, so the pattern appears
@@ -169,7 +172,7 @@ def thesis(
     leds: LedMap,
     lever: Lever,
     body_from_lab: Rotation,
-) -> tuple[Rotation, Floats]:
+) -> Solution:
     """Solve by AFIT's method: place each LED on a sphere of radius R - M about the camera (Padro 2012, eqs 43-45).
 
     1. Place each LED in camera axes by `thesis_points`.
@@ -203,7 +206,7 @@ def tappe(
     leds: LedMap,
     lever: Lever,
     body_from_lab: Rotation,
-) -> tuple[Rotation, Floats]:
+) -> Solution:
     """Solve by NPS's method: compute the LEDs' distances at the last attitude, solve Wahba's problem, and iterate.
 
     The geometry is R_0 + alpha_i b_i = A beta_i r_i with the camera at R_0, the ray b_i, the LED at beta_i r_i and the
@@ -239,7 +242,7 @@ def ray_on_surface(
     leds: LedMap,
     lever: Lever,
     body_from_lab: Rotation,
-) -> tuple[Rotation, Floats]:
+) -> Solution:
     """Solve by placing each LED where its ray meets the believed ellipsoid, and iterate.
 
     Until the attitude converges:
@@ -281,7 +284,7 @@ def pnp(
     leds: LedMap,
     lever: Lever,
     body_from_lab: Rotation,
-) -> tuple[Rotation, Floats]:
+) -> Solution:
     """Fit attitude and camera position (perspective-n-point), six unknowns, from N >= 4 rays; ignores the bearing.
 
     With the pattern's mean position as origin, q = b + t, b = A (P - mean P). The unknowns are the rotation w and the
@@ -382,7 +385,7 @@ def _six_dof_residual(
     return (measured - q[:, :2] / q[:, 2:]).ravel() * weight, jacobian * weight[:, None]
 
 
-NearFieldSolver = Callable[..., tuple[Rotation, Floats]]
+NearFieldSolver = Callable[..., Solution]
 SOLVERS: dict[str, NearFieldSolver] = {
     "rotation_only": rotation_only,
     "ray_on_surface": ray_on_surface,

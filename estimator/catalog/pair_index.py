@@ -16,11 +16,10 @@ sorted by separation, and are searched by bisection (`neighbor_range`).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimator.catalog import sky_index
 from estimator.catalog.sky_index import Cells
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints, Ints32
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 
@@ -58,15 +57,15 @@ class PairIndex(NamedTuple):
     """
 
     vectors: Floats
-    pair: NDArray[np.int32]
+    pair: Ints32
     angle_rad: Floats
-    kvector: NDArray[np.int64]
+    kvector: Ints
     slope_rad: float
     offset_rad: float
-    first: NDArray[np.int64]
-    neighbor: NDArray[np.int32]
+    first: Ints
+    neighbor: Ints32
     separation_rad: Floats
-    group: NDArray[np.int64]
+    group: Ints
     max_angle_rad: float
     magnitude: Floats
     cells: Cells
@@ -75,7 +74,7 @@ class PairIndex(NamedTuple):
 def build(
     vectors: Floats,
     max_angle_rad: float,
-    group: NDArray[np.int64] | None = None,
+    group: Ints | None = None,
     magnitude: Floats | None = None,
 ) -> PairIndex:
     """Index all pairs of (N, 3) unit vectors, brightest first, up to an angle.
@@ -133,8 +132,8 @@ def build(
 
 
 def _neighbor_lists(
-    pair: NDArray[np.int32], angle_rad: Floats, stars: int
-) -> tuple[NDArray[np.int64], NDArray[np.int32], Floats]:
+    pair: Ints32, angle_rad: Floats, stars: int
+) -> tuple[Ints, Ints32, Floats]:
     """The fields `first`, `neighbor` and `separation_rad` of PairIndex: each pair is in the lists of both its stars."""
     owner = np.concatenate([pair[:, 0], pair[:, 1]])
     other = np.concatenate([pair[:, 1], pair[:, 0]])
@@ -144,7 +143,7 @@ def _neighbor_lists(
     return first, other[by_owner], both_angles[by_owner]
 
 
-def k_vector(angle_rad: Floats) -> tuple[NDArray[np.int64], float, float]:
+def k_vector(angle_rad: Floats) -> tuple[Ints, float, float]:
     """The k-vector of sorted angles, with the slope and the offset of its line.
 
     The line runs from just below the smallest to just above the largest angle: z(k) = slope k + offset with

@@ -35,7 +35,7 @@ from estimator.catalog.sky_index import (
     within,
 )
 from estimator.core import vectors
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints, Ints32
 from estimator.core.jit import jit
 
 # Stars of quads in a circle as high as the field; the least number, and the number of circles that reduces it.
@@ -67,9 +67,9 @@ class QuadIndex(NamedTuple):
         (SIDE^4 + 1,) quads first[k] to first[k + 1] are in cell k
     """
 
-    star: NDArray[np.int32]
+    star: Ints32
     code: NDArray[np.float32]
-    first: NDArray[np.int32]
+    first: Ints32
 
 
 def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
@@ -100,9 +100,7 @@ def _chord(angle_rad: float) -> float:
 
 
 @jit
-def _locally_bright(
-    cells: Cells, xyz: Floats, radius: float, count: float
-) -> NDArray[np.int32]:
+def _locally_bright(cells: Cells, xyz: Floats, radius: float, count: float) -> Ints32:
     """Step 1: rows of the stars, sorted by brightness, with fewer than `count` brighter ones within a chord."""
     near = np.empty(len(xyz), np.int64)
     chosen = np.empty(len(xyz), np.bool_)
@@ -228,7 +226,7 @@ def code_cell(value: float, axis: int) -> int:
 
 
 @jit
-def _grid_cells(code: NDArray) -> NDArray[np.int64]:
+def _grid_cells(code: NDArray) -> Ints:
     """(Q,) number of the cell of each code (Q, 4) in the grid of SIDE^4 cells."""
     cell = np.zeros(len(code), np.int64)
     for n in range(len(code)):

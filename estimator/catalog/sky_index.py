@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints, Ints32
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.vectors import row, squared_chord
@@ -44,8 +44,8 @@ class Cells(NamedTuple):
     """
 
     side: int
-    first: NDArray[np.int32]
-    row: NDArray[np.int32]
+    first: Ints32
+    row: Ints32
 
 
 def build_grid(vectors: Floats) -> Cells:
@@ -58,7 +58,7 @@ def build_grid(vectors: Floats) -> Cells:
 
 
 @jit
-def _cube_cells(vectors: Floats, side: int) -> NDArray[np.int64]:
+def _cube_cells(vectors: Floats, side: int) -> Ints:
     """(N,) number of the cell of each unit vector (N, 3); cells adjacent in z have successive numbers."""
     cell = np.empty(len(vectors), np.int64)
     for n in range(len(vectors)):
@@ -68,7 +68,7 @@ def _cube_cells(vectors: Floats, side: int) -> NDArray[np.int64]:
 
 
 @jit
-def counting_sort(cell: NDArray, cells: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+def counting_sort(cell: NDArray, cells: int) -> tuple[Ints32, Ints32]:
     """Sort N things by their cell, in a time proportional to N; the order within a cell is kept.
 
     Parameters
@@ -220,13 +220,13 @@ class SkyIndex(NamedTuple):
     """
 
     vectors: Floats
-    pair: NDArray[np.int32]
-    first: NDArray[np.int32]
+    pair: Ints32
+    first: Ints32
     bin_rad: float
     mag: Floats
     density: Floats
-    cell_first: NDArray[np.int32]
-    cell_star: NDArray[np.int32]
+    cell_first: Ints32
+    cell_star: Ints32
     side: int
 
     @property
@@ -274,7 +274,7 @@ def build(
     return sky._replace(pair=pair[order], first=first, bin_rad=bin_rad)
 
 
-def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[NDArray[np.int32], Floats]:
+def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[Ints32, Floats]:
     """The (P, 2) rows of all pairs of (N, 3) unit vectors up to an angle, and their (P,) angles."""
     chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)

@@ -48,10 +48,9 @@ def _moments(
         Prior information about the frame: streak, saturation
     """
     image = prepare(image, blobs, gain_e_dn, priors)
-    sky = blobs.background
     every = np.arange(len(blobs))
     return _to_centroids(
-        kernel(image, blobs.box_px, every, sky.level, sky.noise, float(gain_e_dn))
+        kernel(image, blobs.box_px, every, *blobs.background, float(gain_e_dn))
     )
 
 
@@ -88,9 +87,8 @@ def _fit_windows(
     image: NDArray, blobs: Blobs, gain_e_dn: float, _priors: FramePriors
 ) -> Floats:
     """Return the rows of `moments.gaussian_windowed`."""
-    sky = blobs.background
     return moments.gaussian_windowed(
-        image, blobs.xy_px, blobs.box_px, sky.level, sky.noise, float(gain_e_dn)
+        image, blobs.xy_px, blobs.box_px, *blobs.background, float(gain_e_dn)
     )
 
 
@@ -109,15 +107,13 @@ def _fit_gaussians(
     image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors
 ) -> Floats:
     """Return the rows of `gaussian_fit.fit_all`."""
-    sky = blobs.background
     return gaussian.fit_all(
         image,
         blobs.xy_px,
         blobs.flux,
         blobs.box_px,
         blobs.peak,
-        sky.level,
-        sky.noise,
+        *blobs.background,
         float(gain_e_dn),
         priors.saturation,
     )
@@ -267,15 +263,13 @@ def _acceleration(ahead: Floats, variances: Floats) -> tuple[float, float]:
 
 def _fit_disks(image: NDArray, blobs: Blobs, gain_e_dn: float, priors: FramePriors) -> Floats:
     """Return x, y, sigma and flux of `disk_fit.fit_all`."""
-    sky = blobs.background
     rows = disk_fit.fit_all(
         image,
         blobs.xy_px,
         blobs.flux,
         blobs.area_px,
         blobs.box_px,
-        sky.level,
-        sky.noise,
+        *blobs.background,
         float(gain_e_dn),
         priors.saturation,
     )
@@ -378,15 +372,13 @@ def _fit_around(
     tightness: float = 1.0,
 ) -> Floats:
     """Return the rows of `streak_fit.fit_all` around centers and streaks (N, 2), NaN but for the blobs `which`."""
-    sky = blobs.background
     chosen_px = np.zeros_like(expected_px)
     chosen_px[which] = expected_px[which]
     return streak_fit.fit_all(
         image,
         xy_px,
         blobs.box_px,
-        sky.level,
-        sky.noise,
+        *blobs.background,
         chosen_px,
         float(gain_e_dn),
         priors.saturation,
@@ -403,9 +395,8 @@ def _with_fallback(rows: Floats, image: NDArray, blobs: Blobs, gain_e_dn: float)
     """Replace the rows that are NaN by those of the center of gravity, in place."""
     failed = np.flatnonzero(np.isnan(rows[:, 0]))
     if len(failed):
-        sky = blobs.background
         rows[failed] = moments.center_of_gravity(
-            image, blobs.box_px, failed, sky.level, sky.noise, float(gain_e_dn)
+            image, blobs.box_px, failed, *blobs.background, float(gain_e_dn)
         )
     return rows
 

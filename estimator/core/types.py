@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -104,22 +105,18 @@ class RateEstimate:
 SIGN_CHI2 = 16.0  # least difference of the chi-squares of both signs of a rate that determines the sign
 
 
-@frozen
-class Background:
-    """Sky level and noise of an image, on a coarse grid of tile centers.
+class Background(NamedTuple):
+    """Sky level and noise of an image, on a coarse grid of tile centers. A named tuple: kernels take both in order.
 
     Attributes
     ----------
     level, noise
         (rows, columns) sky level, and noise of the filtered image, in the image's units; bilinear
         between the centers
-    tile_px
-        Side of a tile
     """
 
     level: Floats
     noise: Floats
-    tile_px: int
 
 
 @frozen

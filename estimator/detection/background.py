@@ -65,7 +65,7 @@ def estimate_background(image: NDArray) -> Background:
     samples: NDArray = np.empty(INITIAL_SAMPLES, sample_type)
     level, noise = _tiles(image, tile_px, np.empty(image.shape[1], sum_type), samples)
     step = 1.0 if image.dtype.kind in "iu" else float(image.max() - image.min()) / FLOAT_STEPS
-    return Background(level, np.maximum(noise, FILTERED_NOISE * step / np.sqrt(12)), tile_px)
+    return Background(level, np.maximum(noise, FILTERED_NOISE * step / np.sqrt(12)))
 
 
 def accumulator_type(pixel: np.dtype, greatest: float = np.inf) -> type:
@@ -98,7 +98,7 @@ def cleaned(
     """
     blobs = detect(image, *options, priors)
     # 1. Sky
-    if is_steep(blobs.background.level, blobs.background.noise):
+    if is_steep(*blobs.background):
         image = flattened(image, priors.saturation)
         blobs = detect(image, *options, priors)
     # 2. Smear

@@ -22,10 +22,13 @@ from math import atan2, cos, hypot, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Bools, Floats, Ints, Step
 from estimator.core.jit import jit
 from estimator.core.types import Blobs, FramePriors
 from estimator.detection.background import FILTERED_NOISE, filtered, interpolate
+
+Line = tuple[float, float]  # L^2 (cos 2a, sin 2a) of a streak of length L and direction a
+Field = tuple[float, float, float]  # streak (dx, dy) at the image's center, and turn
 
 # Text burned into a picture: dates, names of cameras, exposure times.
 
@@ -39,7 +42,7 @@ UNEQUAL_WIDTH = 1.25  # least ratio of the widest to the narrowest letter
 MARGIN = 0.5  # margin around a line of text over the height
 
 
-def find_captions(boxes: Ints, peak: Floats) -> NDArray[np.bool_]:
+def find_captions(boxes: Ints, peak: Floats) -> Bools:
     """Return (N,) whether a blob belongs to a line of text, from the blobs' boxes (x0, y0, x1, y1) and peaks.
 
     A line of text is a chain of blobs side by side on one base line that are equally high and equally bright, and
@@ -164,9 +167,8 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     """
     if not len(blobs):
         return replace(blobs, streak_px=priors.streak_px)
-    background = blobs.background
     # 1. Shapes
-    shape = _shapes(image, blobs.box_px, background.level, background.noise)
+    shape = _shapes(image, blobs.box_px, *blobs.background)
     # 2. Text, in photographs. Streaks of a known length have boxes of one height, as letters do.
     text = np.zeros(len(blobs), bool)
     streak_px = priors.streak_px
@@ -190,7 +192,7 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
         blobs.box_px,
         blobs.xy_px,
         blobs.peak,
-        background.noise,
+        blobs.background.noise,
         image.shape,
         (x, y, turn_rad),
         streak_px is not None,
@@ -203,9 +205,7 @@ def classify(image: NDArray, blobs: Blobs, priors: FramePriors) -> Blobs:
     return replace(blobs, flag=flag | TEXT * text, streak_px=streak_px, turn_rad=turn_rad)
 
 
-def streaks_px(
-    blobs: Blobs, shape: tuple[int, ...], streak_px: tuple[float, float]
-) -> Floats:
+def streaks_px(blobs: Blobs, shape: tuple[int, ...], streak_px: Step) -> Floats:
     """Return the (N, 2) streak of each blob: v(x) = t + w J (x - c), with the streak t at the image's center c."""
     x, y = (blobs.xy_px - np.array([shape[1] - 1, shape[0] - 1]) / 2).T
     return np.array(streak_px) + blobs.turn_rad * np.column_stack([-y, x])
@@ -213,8 +213,7 @@ def streaks_px(
 
 def moments(image: NDArray, blobs: Blobs) -> Floats:
     """Return the (N, 3) second moments of each blob, px^2: xx - yy, 2 xy and xx + yy."""
-    background = blobs.background
-    _, _, across, x, y = _shapes(image, blobs.box_px, background.level, background.noise).T
+    _, _, across, x, y = _shapes(image, blobs.box_px, *blobs.background).T
     # xx + yy is the sum of the eigenvalues: twice the smaller one, and their difference.
     return np.column_stack([x / 12, y / 12, 2 * across + np.hypot(x, y) / 12])
 
@@ -227,7 +226,7 @@ def _flags(
     peak: Floats,
     noise: Floats,
     size: tuple[int, int],
-    field: tuple[float, float, float],
+    field: Field,
     smeared: bool,
     saturation: float,
     step: float,
@@ -339,7 +338,7 @@ def _on_line(shape: Floats, xy: Floats, start: Floats, x: float, y: float) -> bo
 
 
 @jit
-def _common_line(lines: Floats) -> tuple[float, float]:
+def _common_line(lines: Floats) -> Line:
     """Return the line, as L^2 (cos 2a, sin 2a), that over 60 % of the brightest blobs share, or (0, 0).
 
     1. Take the median line if over 60 % are like it.
@@ -379,9 +378,7 @@ def _count_same(lines: Floats, x: float, y: float) -> int:
 
 
 @jit
-def _field(
-    lines: Floats, xy: Floats, center: tuple[float, float], line: tuple[float, float]
-) -> tuple[float, float, float]:
+def _field(lines: Floats, xy: Floats, center: tuple[float, float], line: Line) -> Field:
     """Return the streak (dx, dy) at the center and the turn that most of the brightest blobs share.
 
     1. Take the common line without a turn, if no blob would be a track then.
@@ -426,11 +423,11 @@ def _field(
 @jit
 def _field_of_two(
     start: Floats,
-    first: tuple[float, float],
+    first: Step,
     end: Floats,
-    second: tuple[float, float],
+    second: Step,
     center: tuple[float, float],
-) -> tuple[float, float, float]:
+) -> Field:
     """Return the field (dx, dy, turn) of two streaks at two places by least squares.
 
     The turn w follows from their difference, w J (x2 - x1), and the streak t at the center from their mean.
@@ -449,7 +446,7 @@ def _field_of_two(
 
 @jit
 def _agreement(
-    lines: Floats, xy: Floats, center: tuple[float, float], field: tuple[float, float, float]
+    lines: Floats, xy: Floats, center: tuple[float, float], field: Field
 ) -> tuple[float, int]:
     """Return the score of a field, and how many of the blobs that agree with it are streaks.
 
@@ -472,19 +469,19 @@ def _agreement(
 
 
 @jit
-def _line_at(field: tuple[float, float, float], x: float, y: float) -> tuple[float, float]:
+def _line_at(field: Field, x: float, y: float) -> Line:
     """Return the line L^2 (cos 2a, sin 2a) of a field's streak at (x, y) from the center."""
     return _double_angle(field[0] - field[2] * y, field[1] + field[2] * x)
 
 
 @jit
-def _double_angle(x: float, y: float) -> tuple[float, float]:
+def _double_angle(x: float, y: float) -> Line:
     """Return L^2 (cos 2a, sin 2a) of a streak (dx, dy)."""
     return x * x - y * y, 2 * x * y
 
 
 @jit
-def _half_angle(line: tuple[float, float]) -> tuple[float, float]:
+def _half_angle(line: Line) -> Step:
     """Return the streak (dx, dy), up to its sign, of a line L^2 (cos 2a, sin 2a)."""
     length = sqrt(hypot(line[0], line[1]))
     angle = atan2(line[1], line[0]) / 2

@@ -19,7 +19,7 @@ from math import floor
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, Ints
+from estimator.core.checks import Floats, Ints, Ints32
 from estimator.core.jit import jit
 from estimator.detection.background import (
     accumulator_type,
@@ -28,7 +28,6 @@ from estimator.detection.background import (
     interpolate,
 )
 
-Ints32 = NDArray[np.int32]  # half the memory where there are millions of runs
 FIRST_RUNS = 2048  # capacity of the first pass; a second pass follows if there are more runs
 # Columns of a blob's sums: number of pixels; number of pixels above the higher threshold; sums of I, I x and I y;
 # largest pixel; largest filtered value above the sky, and its x and y.

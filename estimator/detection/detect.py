@@ -22,7 +22,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from estimator.core.checks import Floats, Ints, native, number, of_type
+from estimator.core.checks import Floats, Ints, Ints32, Step, native, number, of_type
 from estimator.core.errors import ImageError
 from estimator.core.types import NO_PRIORS, Background, Blobs, FramePriors
 from estimator.detection import classify
@@ -33,7 +33,6 @@ from estimator.detection.background import (
     median,
 )
 from estimator.detection.components import (
-    Ints32,
     accumulate_blobs,
     brightest_blobs,
     label_runs,
@@ -130,7 +129,7 @@ def _classified(
         large = np.any(blobs.area_px >= LARGE_PX)
         if priors.streak_px is not None or stars >= FEW_STARS or large:
             return blobs
-        if is_steep(background.level, background.noise):
+        if is_steep(*background):
             return blobs
         faint = detect_faint_streaks(image, background, threshold_sigma, max_blobs, priors)
         if len(faint) <= stars + 1:
@@ -159,8 +158,14 @@ def _classified_streaks(
     return classify.classify(image, streaks, along)
 
 
+def flat_background(image: NDArray) -> Background:
+    """Return one level and noise for the whole frame: the medians over the tiles."""
+    grids = estimate_background(image)
+    return Background(*(np.full((1, 1), median(grid)) for grid in grids))
+
+
 def _local(
-    flat: bool,
+    background: Callable[[NDArray], Background],
     image: NDArray,
     threshold_sigma: float = 5.0,
     min_area_px: int = 3,
@@ -169,14 +174,14 @@ def _local(
 ) -> Blobs:
     """Detect blobs `threshold_sigma` above the local sky, or one for the frame, after a 3x3 binomial filter."""
     image = prepare_image(image, threshold_sigma, min_area_px, max_blobs)
-    sky = flat_background(image) if flat else estimate_background(image)
+    sky = background(image)
     return detect_blobs(image, sky, threshold_sigma * sky.noise, min_area_px, max_blobs)
 
 
-local = partial(_local, False)
+local = partial(_local, estimate_background)
 """Detect blobs `threshold_sigma` above the local sky after a 3x3 binomial filter."""
 
-components = partial(_local, True)
+components = partial(_local, flat_background)
 """Detect blobs above a global threshold: the frame's median sky plus `threshold_sigma` times its noise."""
 
 
@@ -388,14 +393,6 @@ def replace_bad_pixels(image: NDArray, bad_px: Ints) -> NDArray:
     return repaired
 
 
-def flat_background(image: NDArray) -> Background:
-    """Return one level and noise for the whole frame: the medians over the tiles."""
-    background = estimate_background(image)
-    level = median(background.level)
-    noise = median(background.noise)
-    return Background(np.full((1, 1), level), np.full((1, 1), noise), max(image.shape))
-
-
 def detect_blobs(
     image: NDArray,
     background: Background,
@@ -514,7 +511,7 @@ def in_full_length(
     return _classified_streaks(image, found.background, threshold_sigma, max_blobs, along)
 
 
-def line_taps(streak_px: tuple[float, float]) -> Ints:
+def line_taps(streak_px: Step) -> Ints:
     """Return the (K, 2) pixel offsets of a line centered on 0, one per pixel along its longer axis."""
     count = max(round(max(map(abs, streak_px))), 1) | 1
     along = (np.arange(count) - count // 2) / count

@@ -48,10 +48,8 @@ def in_windows(
     image = prepare_image(image)
     # The background is a sparse sample of the frame; only the windows are read in full.
     background = estimate_background(image)
-    level = background.level
-    noise = background.noise
     rows = np.ascontiguousarray(center_px, dtype=float)
-    boxes, sums, count = _brightest(image, rows, half_px, level, noise, threshold_sigma)
+    boxes, sums, count = _brightest(image, rows, half_px, *background, threshold_sigma)
     blobs = to_blobs(boxes[:count], sums[:count], 0, len(rows), background)
     return classify(image, blobs, priors)
 

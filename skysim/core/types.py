@@ -29,7 +29,7 @@ def normalized(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def around_z(radius: Any, azimuth_rad: Array, z: Any) -> Floats:
+def around_z(radius: Any, azimuth_rad: Any, z: Any) -> Floats:
     """(..., 3) points at distances from the z axis, azimuths from +x toward +y, and heights; these are broadcast."""
     x = radius * np.cos(azimuth_rad)
     y = radius * np.sin(azimuth_rad)

@@ -337,11 +337,9 @@ def set_key(tree: Tree, key: str, value: str) -> None:
         ) from error
 
 
-def one_line(value: Any, sort_keys: bool = True) -> str:
-    """A value as YAML on one line."""
-    dumped = yaml.safe_dump(
-        value, default_flow_style=True, width=1_000_000, sort_keys=sort_keys
-    )
+def one_line(value: Any, **options: Any) -> str:
+    """A value as YAML on one line, with further options of YAML's writer."""
+    dumped: str = yaml.safe_dump(value, default_flow_style=True, width=1_000_000, **options)
     return dumped.removesuffix("...\n").strip()
 
 
@@ -485,12 +483,11 @@ def yaml_keys(loc: tuple[int | str, ...], tree: Any, missing: bool) -> list[int 
     keys = []
     for n, key in enumerate(loc):
         last = missing and n == len(loc) - 1
+        if isinstance(tree, list):
+            tree = dict(enumerate(tree))
         if isinstance(tree, dict) and (key in tree or last):
             keys.append(key)
             tree = tree.get(key)
-        elif isinstance(tree, list) and isinstance(key, int) and (key < len(tree) or last):
-            keys.append(key)
-            tree = tree[key] if key < len(tree) else None
     return keys
 
 
@@ -530,7 +527,4 @@ def yaml_line(value: Any) -> str:
     """Format a value as one line of YAML; strings are returned unchanged."""
     if isinstance(value, str):
         return value
-    text = yaml.safe_dump(
-        value, default_flow_style=True, width=10_000, allow_unicode=True, sort_keys=False
-    )
-    return text.strip().removesuffix("...").strip()
+    return one_line(value, allow_unicode=True, sort_keys=False)

@@ -330,7 +330,7 @@ def print_blocks(blocks: Sequence[Block]) -> None:
     for block in filter(is_printed, blocks):
         match block:
             case Section(title=title, blocks=inner) if any(map(is_printed, inner)):
-                console().print(styled(Cell(title), "bold"))
+                console().print(styled(title, "bold"))
                 print_blocks(inner)
                 print()
             case Items(lines=lines, title=title, tone=tone):
@@ -368,15 +368,15 @@ def print_table(table: Table, title: str = "") -> None:
     every = table.cells()
     rows = every[:MAX_ROWS]
     shown = fitting_columns(table, rows)
-    heading = styled(Cell(title), "") if title else None
+    heading = styled(title) if title else None
     grid = rich_table.Table(box=None, header_style="bold", pad_edge=False, title=heading)
     grid.title_justify = "left"
     for n in shown:
         column = table.columns[n]
         justify: Any = "right" if column.kind == "number" else "left"
-        grid.add_column(styled(Cell(column.head), ""), justify=justify, no_wrap=True)
+        grid.add_column(styled(column.head), justify=justify, no_wrap=True)
     for row in rows:
-        grid.add_row(*(styled(row[n], COLORS.get(row[n].tone, "")) for n in shown))
+        grid.add_row(*(styled(row[n].text, COLORS.get(row[n].tone, "")) for n in shown))
     console().print(grid)
     for row in rows:
         for column, one in zip(table.columns, row, strict=True):
@@ -404,11 +404,11 @@ def fitting_columns(table: Table, rows: Sequence[Sequence[Cell]]) -> list[int]:
     return shown
 
 
-def styled(cell: Cell, style: str) -> Any:
-    """A cell's text literally: rich's markup in it has no effect."""
-    from rich import text
+def styled(text: str, style: str = "") -> Any:
+    """A text literally: rich's markup in it has no effect."""
+    from rich.text import Text as RichText
 
-    return text.Text(printable(cell.text), style)
+    return RichText(printable(text), style)
 
 
 def print_wrapped(

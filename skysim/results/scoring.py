@@ -20,6 +20,10 @@ from skysim.scene.scene import Scene
 from skysim.simulation.flight import Shot
 from skysim.simulation.lab import StarCamera
 
+Angles = tuple[
+    float, float, float
+]  # RA, Dec, roll, or roll, pitch, yaw of the vehicle, degrees
+
 
 @frozen
 class FrameRow:
@@ -55,8 +59,8 @@ class FrameRow:
     t_s: float
     rate_deg_s: float
     status: str
-    truth_deg: tuple[float, float, float]
-    estimate_deg: tuple[float, float, float] | None
+    truth_deg: Angles
+    estimate_deg: Angles | None
     cross_arcsec: float
     roll_arcsec: float
     detected: int
@@ -82,7 +86,7 @@ def angle_names(scene: Scene) -> tuple[str, str, str]:
     return ("RA", "Dec", "roll") if scene.stars else ("roll", "pitch", "yaw")
 
 
-def angles_deg(cam_from_lab: Rotation, camera: StarCamera) -> tuple[float, float, float]:
+def angles_deg(cam_from_lab: Rotation, camera: StarCamera) -> Angles:
     """RA, Dec, roll of the camera under the stars; otherwise roll, pitch, yaw (3-2-1 sequence) of the vehicle."""
     if camera.scene.stars:
         ra, dec, roll = np.degrees(ra_dec_roll_rad(cam_from_lab))
@@ -100,7 +104,7 @@ def scored_attitude(camera: StarCamera, truth: Truth) -> Rotation:
     return camera.mount.cam_from_body * truth.mean_lab_from_body.inv()
 
 
-def true_angles_deg(camera: StarCamera, truth: Truth) -> tuple[float, float, float]:
+def true_angles_deg(camera: StarCamera, truth: Truth) -> Angles:
     """`angles_deg` of the truth that solutions are compared with."""
     return angles_deg(scored_attitude(camera, truth), camera)
 

@@ -95,16 +95,16 @@ def findings(log: Telemetry) -> list[str]:
     return list(filter(None, found))
 
 
+def components(head: str, values: Floats, ends: Sequence[str] = AXES) -> Record:
+    """The columns of (K, N) values, whose heads differ in the word for {}."""
+    return {head.format(end): column for end, column in zip(ends, values.T, strict=True)}
+
+
 def table(log: Telemetry) -> Any:
     """Telemetry as an astropy table, one row per control tick; angles in degrees."""
     from astropy.table import Table
 
     columns: Record = {"t_s": log.t_s}
-
-    def add(name: str, values: Floats, unit: str, ends: Sequence[str] = AXES) -> None:
-        for end, column in zip(ends, values.T, strict=True):
-            columns[f"{name}_{end}_{unit}"] = column
-
     attitudes = {
         "true": log.lab_from_body,
         "commanded": log.lab_from_ref,
@@ -113,21 +113,16 @@ def table(log: Telemetry) -> Any:
     }
     for name, attitude in attitudes.items():
         if attitude is not None:
-            add(name, euler_deg(attitude), "deg", EULER)
+            columns |= components(f"{name}_{{}}_deg", euler_deg(attitude), EULER)
     pointing = attitude_error_deg(log.lab_from_ref, log.lab_from_body)
     if pointing is not None:
         columns["pointing_error_deg"] = pointing
-    add("rate", np.degrees(log.rate_body_rad_s), "deg_s")
-    add("torque", log.torque_nm, "nm")
-    add("disturbance", log.disturbance_nm, "nm")
-    add("momentum", log.momentum_nms, "nms")
-    for names, joints, unit in (
-        (log.wheel_names, log.wheel_rad_s / RPM_RAD_S, "rpm"),
-        (log.gimbal_names, np.degrees(log.gimbal_rad), "deg"),
-    ):
-        columns |= {
-            f"{name}_{unit}": column for name, column in zip(names, joints.T, strict=True)
-        }
+    columns |= components("rate_{}_deg_s", np.degrees(log.rate_body_rad_s))
+    columns |= components("torque_{}_nm", log.torque_nm)
+    columns |= components("disturbance_{}_nm", log.disturbance_nm)
+    columns |= components("momentum_{}_nms", log.momentum_nms)
+    columns |= components("{}_rpm", log.wheel_rad_s / RPM_RAD_S, log.wheel_names)
+    columns |= components("{}_deg", np.degrees(log.gimbal_rad), log.gimbal_names)
     columns |= {f"load_{name}": load for name, load in log.loads.items()}
     for name, values in log.readings.items():
         for n, column in enumerate(values.reshape(len(values), -1).T):
@@ -143,12 +138,14 @@ def table(log: Telemetry) -> Any:
     }
     for name, rates in biases.items():
         if rates is not None:
-            add(name, per_hour(rates), "deg_h")
+            columns |= components(f"{name}_{{}}_deg_h", per_hour(rates))
     if log.sigma_attitude_rad is not None:
-        add("sigma_attitude", np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG, "arcsec")
+        sigma_arcsec = np.degrees(log.sigma_attitude_rad) / ARCSEC_DEG
+        columns |= components("sigma_attitude_{}_arcsec", sigma_arcsec)
     for name, mounting in log.mountings.items():
         for kind, values_rad in zip(("", "sigma_", "true_"), mounting, strict=True):
-            add(f"{kind}mounting_{name}", values_rad / ARCSEC_RAD, "arcsec")
+            head = f"{kind}mounting_{name}_{{}}_arcsec"
+            columns |= components(head, values_rad / ARCSEC_RAD)
     return Table(columns)
 
 
@@ -160,10 +157,8 @@ def imu_table(record: Increments) -> Any:
     from astropy.table import Table
 
     columns: Record = {"t_s": record.t_s}
-    for n, end in enumerate(AXES):
-        columns[f"angle_{end}_rad"] = record.angle_rad[:, n]
-    for n, end in enumerate(AXES):
-        columns[f"velocity_{end}_m_s"] = record.velocity_m_s[:, n]
+    columns |= components("angle_{}_rad", record.angle_rad)
+    columns |= components("velocity_{}_m_s", record.velocity_m_s)
     level_deg = np.degrees([tilt_rad(velocity[None]) for velocity in record.velocity_m_s])
     columns["level_roll_deg"], columns["level_pitch_deg"] = level_deg.T
     columns["gyro_saturated"] = record.saturated

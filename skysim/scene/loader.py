@@ -355,9 +355,7 @@ def with_overrides(tree: Tree, overrides: OverrideTexts) -> Tree:
     return tree
 
 
-def load_scene(
-    name: str | Path | Mapping[str, Any], overrides: Mapping[str, Any] | None = None
-) -> Scene:
+def load_scene(name: str | Path | Keys, overrides: Keys | None = None) -> Scene:
     """`load` for Python: values of overrides may also be numbers, lists and mappings.
 
         load_scene("shefex2", {"exposure.frames": 3, "exposure": {"time": "20 ms"}})

@@ -26,6 +26,7 @@ from skysim.scene.camera_sheet import rounded
 from skysim.scene.loader import Layer
 from skysim.scene.scene import NAME_ALIAS
 
+KeyPath = tuple[str, ...]  # nested keys
 COMMENT_COLUMN = 44  # column of the origins; a longer line has its origin at its end
 
 
@@ -59,7 +60,7 @@ class Entry(NamedTuple):
         Reason why the key has no effect in this scene; empty if it has one
     """
 
-    path: tuple[str, ...]
+    path: KeyPath
     value: Any
     origin: Origin
     no_effect: str = ""
@@ -71,7 +72,7 @@ class Source(NamedTuple):
     what: str
     tree: Tree
     file: str = ""
-    lines: Mapping[tuple[str, ...], int] = {}
+    lines: Mapping[KeyPath, int] = {}
 
 
 def effective(name: str | Path, overrides: OverrideTexts | None = None) -> list[Entry]:
@@ -94,13 +95,13 @@ def effective(name: str | Path, overrides: OverrideTexts | None = None) -> list[
             0, Source(f"calibration {Path(calibration).name}", keys, str(calibration))
         )
     # 2. Fields of the scene. 3. Reasons.
-    found = []
-    for entry in entries(scene, tree, sources):
-        if entry.path != (NAME_ALIAS,):
-            unset = entry.value is None
-            reason = "" if unset else unused.reason(".".join(entry.path), scene)
-            found.append(entry._replace(no_effect=reason))
-    return found
+    return [
+        entry
+        if entry.value is None
+        else entry._replace(no_effect=unused.reason(".".join(entry.path), scene))
+        for entry in entries(scene, tree, sources)
+        if entry.path != (NAME_ALIAS,)
+    ]
 
 
 def sources_of(layers: list[Layer], overrides: OverrideTexts) -> list[Source]:
@@ -122,7 +123,7 @@ def sources_of(layers: list[Layer], overrides: OverrideTexts) -> list[Source]:
     return found
 
 
-def value_at(tree: Any, keys: tuple[str, ...]) -> Any:
+def value_at(tree: Any, keys: KeyPath) -> Any:
     """The value at nested keys of a tree; ABSENT if there is none."""
     for key in keys:
         tree = tree.get(key, ABSENT) if isinstance(tree, dict) else ABSENT
@@ -130,7 +131,7 @@ def value_at(tree: Any, keys: tuple[str, ...]) -> Any:
 
 
 def entries(
-    model: ConfigModel, tree: Any, sources: list[Source], parent: tuple[str, ...] = ()
+    model: ConfigModel, tree: Any, sources: list[Source], parent: KeyPath = ()
 ) -> Iterator[Entry]:
     """Yield the keys of a section and of the sections in it.
 
@@ -164,7 +165,7 @@ def entries(
             yield Entry(path, raw if written else plain(value, name), origin)
 
 
-def origin_of(keys: tuple[str, ...], value: Any, sources: list[Source]) -> Origin:
+def origin_of(keys: KeyPath, value: Any, sources: list[Source]) -> Origin:
     """The origin of a value at nested keys of the merged tree; that of a mapping is the origin of its first value."""
     while isinstance(value, dict) and value:
         key = next(iter(value))

@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache
 from typing import Any
 
+from pydantic.fields import FieldInfo
+
 from skysim.core.errors import OVERRIDES, InputError
 from skysim.core.units import ConfigModel
 from skysim.core.yaml_reader import Files, Keys, OverrideTexts, parse_yaml, where_of
@@ -99,9 +101,12 @@ def find(
 
 
 def reason(key: str, scene: Scene) -> str:
-    """The reason why a dotted key has no effect in a scene; empty if it has one."""
-    rules = (rule for rule in RULES if section_of(key, rule) and rule.applies(scene))
-    return next((rule.reason for rule in rules), "")
+    """The reason why a dotted key has no effect in a scene; empty if it has one, or if the scene has no such key."""
+    for rule in RULES:
+        section = section_of(key, rule)
+        if section and field_at(scene, section) and rule.applies(scene):
+            return rule.reason
+    return ""
 
 
 def section_of(key: str, rule: Rule) -> str:
@@ -109,20 +114,24 @@ def section_of(key: str, rule: Rule) -> str:
     return next((name for name in rule.keys if key == name or key.startswith(f"{name}.")), "")
 
 
-def differs(model: Any, dotted: str) -> bool:
+def differs(model: ConfigModel, dotted: str) -> bool:
     """Whether the model has a value at a dotted key of YAML that is not the default of its field."""
-    path = dotted.split(".")
-    for depth, key in enumerate(path):
+    found = field_at(model, dotted)
+    if found is None:
+        return False
+    field, value = found
+    return field.is_required() or bool(value != field.get_default(call_default_factory=True))
+
+
+def field_at(model: Any, dotted: str) -> tuple[FieldInfo, Any] | None:
+    """The field at a dotted key of YAML and its value; None if a section that would contain it is absent."""
+    for key in dotted.split("."):
         name = field_names(type(model)).get(key) if isinstance(model, ConfigModel) else None
         if name is None:
-            return False
+            return None
         field = type(model).model_fields[name]
         model = getattr(model, name)
-        if depth == len(path) - 1:
-            return field.is_required() or bool(
-                model != field.get_default(call_default_factory=True)
-            )
-    return False
+    return field, model
 
 
 @cache

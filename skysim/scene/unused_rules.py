@@ -18,12 +18,11 @@ from skysim.scene.sections.layouts import (
     PatchBoardsConfig,
     PixelsConfig,
 )
-from skysim.scene.sections.leds import DirectConfig, PwmConfig
+from skysim.scene.sections.leds import DirectConfig
 from skysim.scene.sections.surroundings import NEGLIGIBLE_PX
 from skysim.scene.sections.tracker import OWN
 
 SURFACE_SOLVERS = ("thesis", "ray_on_surface")  # solvers that use the surveyed surface
-FIXED_DETECTORS = ("thesis",)  # detectors with their own thresholds
 OWN_RULES = ("saa", "shefex", "master_star", "fialho")  # identifiers with their paper's rule
 
 
@@ -35,7 +34,8 @@ class Rule(NamedTuple):
     keys
         Dotted keys; the key of a section stands for all keys in it
     applies
-        Function of the scene (for a study's rule, of the scene and the trial): whether the keys have no effect
+        Function of a scene that has one of the keys (for a study's rule, of the scene and the trial): whether the keys
+        have no effect
     reason, allowed
         Reason and alternative for the error message
     """
@@ -74,23 +74,9 @@ def equally_bright(scene: Scene) -> bool:
     )
 
 
-def free_running_code(scene: Scene) -> bool:
-    """Whether the LEDs' bits have their own clock."""
-    code = scene.dome.led.code if scene.dome else None
-    return code is not None and code.bit_time_s != "frame"
-
-
 def external(scene: Scene) -> bool:
     """Whether the tracker is an external one."""
     return scene.tracker.name != OWN
-
-
-def surface_unused(scene: Scene) -> bool:
-    """Whether a map replaces the surveyed LEDs and the solver does not use the surveyed surface."""
-    tracker = scene.tracker
-    return tracker.map is not None and (
-        external(scene) or tracker.solver not in SURFACE_SOLVERS
-    )
 
 
 def survey_draws_nothing(scene: Scene) -> bool:
@@ -104,12 +90,6 @@ def survey_draws_nothing(scene: Scene) -> bool:
         survey.instrument,
     )
     return not (any(drawn) or (surface_m and survey.surface_seed is None))
-
-
-def listed_boards(scene: Scene) -> bool:
-    """Whether the layout lists its boards."""
-    layout = getattr(scene.light, "layout", None)
-    return isinstance(layout, PatchBoardsConfig) and bool(layout.boards)
 
 
 def dome_draws_nothing(scene: Scene) -> bool:
@@ -153,12 +133,6 @@ def flat_wall(scene: Scene) -> bool:
     return scene.dome is not None and scene.dome.surface.kind == "flat"
 
 
-def has_floor(scene: Scene) -> bool:
-    """Whether a floor reflects the LEDs."""
-    reflection = getattr(scene.light, "reflection", None)
-    return reflection is not None and reflection.floor is not None
-
-
 def seen_from_earth(scene: Scene) -> bool:
     """Whether bodies or satellites are seen from the Earth: from its center, or from a site."""
     bodies, satellites = (getattr(scene.light, key, None) for key in ("bodies", "satellites"))
@@ -173,18 +147,6 @@ def has_air(scene: Scene) -> bool:
 def seen_from_ground(scene: Scene) -> bool:
     """Whether the view depends on the place on the Earth."""
     return has_air(scene) or (seen_from_earth(scene) and scene.site.longitude_deg is not None)
-
-
-def nothing_beside_the_field(scene: Scene) -> bool:
-    """Whether neither a body nor the lit Earth causes stray light."""
-    lit_earth = scene.orbit is not None and scene.orbit.earth is not None
-    return getattr(scene.light, "bodies", None) is None and not lit_earth
-
-
-def seeing_is_narrow(scene: Scene) -> bool:
-    """Whether the seeing is negligible compared with a pixel."""
-    air = getattr(scene.light, "air", None)
-    return air is not None and not air.seeing_px(scene.camera.focal_px)
 
 
 # The rules, by section of the scene.
@@ -303,13 +265,13 @@ RULES = (
     ),
     Rule(
         ("tracker.threshold_sigma", "tracker.min_area_px"),
-        lambda scene: scene.tracker.detector in FIXED_DETECTORS,
+        lambda scene: scene.tracker.detector == "thesis",
         "the detector thesis has its own thresholds",
         "tracker.intensity_threshold, or another tracker.detector, e.g. threshold",
     ),
     Rule(
         ("tracker.intensity_threshold",),
-        lambda scene: scene.tracker.detector not in FIXED_DETECTORS,
+        lambda scene: scene.tracker.detector != "thesis",
         "it is a threshold of the detector thesis",
         "tracker.detector: thesis, or tracker.threshold_sigma",
     ),
@@ -320,7 +282,10 @@ RULES = (
             "tracker.survey.surface_seed",
             "light.surface.error",
         ),
-        surface_unused,
+        lambda scene: (
+            scene.tracker.map is not None
+            and (external(scene) or scene.tracker.solver not in SURFACE_SOLVERS)
+        ),
         "tracker.map replaces the survey of the LEDs, and the solver does not use the surface",
         f"no tracker.map, or tracker.solver {' or '.join(SURFACE_SOLVERS)}",
     ),
@@ -338,19 +303,21 @@ RULES = (
     ),
     Rule(
         ("light.led.pwm_period",),
-        lambda scene: scene.dome and not isinstance(scene.dome.led.drive, PwmConfig),
+        lambda scene: scene.light.led.drive.kind != "pwm",
         "it is the period of the drive pwm",
         "light.led.drive: {kind: pwm}",
     ),
     Rule(
         ("light.led.color_scatter", "light.led.aging.scatter"),
-        lambda scene: isinstance(getattr(scene.light, "layout", None), PixelsConfig),
+        lambda scene: isinstance(scene.light.layout, PixelsConfig),
         "the pixels of a display share their light",
         "another light.layout",
     ),
     Rule(
         ("light.led.clock",),
-        lambda scene: steady(scene) and not free_running_code(scene),
+        lambda scene: (
+            steady(scene) and getattr(scene.light.led.code, "bit_time_s", "frame") == "frame"
+        ),
         "the drive direct has no pulses to time",
         "another light.led.drive",
     ),
@@ -362,7 +329,7 @@ RULES = (
     ),
     Rule(
         ("light.reflection.diffuse",),
-        lambda scene: flat_wall(scene) and not has_floor(scene),
+        lambda scene: flat_wall(scene) and not scene.light.reflection.floor,
         "the LEDs on a flat wall do not shine on it",
         "light.reflection.floor, or another light.surface",
     ),
@@ -373,7 +340,7 @@ RULES = (
             "light.layout.lit",
             "light.layout.pwm_levels",
         ),
-        listed_boards,
+        lambda scene: bool(getattr(scene.light.layout, "boards", ())),
         "light.layout.boards lists the boards",
         "no light.layout.boards",
     ),
@@ -385,7 +352,9 @@ RULES = (
     ),
     Rule(
         ("camera.baffle",),
-        nothing_beside_the_field,
+        lambda scene: (
+            not (getattr(scene.light, "bodies", None) or (scene.orbit and scene.orbit.earth))
+        ),
         "neither a body nor the lit Earth is in the scene",
         "light.bodies or orbit.earth",
     ),
@@ -472,7 +441,7 @@ RULES = (
     ),
     Rule(
         ("light.air.seeing_arcsec",),
-        seeing_is_narrow,
+        lambda scene: not scene.light.air.seeing_px(scene.camera.focal_px),
         f"its standard deviation is below {NEGLIGIBLE_PX:g} px",
         "a longer camera.focal_length or smaller camera.pixel",
     ),
@@ -502,15 +471,13 @@ RULES = (
     ),
     Rule(
         ("thermal.anchor_height",),
-        lambda scene: scene.thermal is not None and not scene.thermal.dome_ppm_k,
+        lambda scene: not scene.thermal.dome_ppm_k,
         "the dome does not expand",
         "thermal.dome_ppm_k",
     ),
     Rule(
         ("thermal.speed",),
-        lambda scene: (
-            scene.thermal is not None and scene.thermal.temperature.kind == "steady"
-        ),
+        lambda scene: scene.thermal.temperature.kind == "steady",
         "the temperature is steady",
         "another thermal.temperature",
     ),
@@ -522,7 +489,7 @@ RULES = (
     ),
     Rule(
         ("light.satellites.standard_mag",),
-        lambda scene: bool(scene.light.satellites and not scene.light.satellites.file),
+        lambda scene: not scene.light.satellites.file,
         "random satellites have their own magnitudes",
         "light.satellites.file",
     ),
@@ -540,19 +507,19 @@ RULES = (
     ),
     Rule(
         ("vehicle.imu.gyro.bias_time",),
-        lambda scene: bool(scene.vehicle.imu and not scene.vehicle.imu.gyro.bias_deg_h),
+        lambda scene: not scene.vehicle.imu.gyro.bias_deg_h,
         "the bias does not vary",
         "vehicle.imu.gyro.bias_deg_h above 0",
     ),
     Rule(
         ("vehicle.imu.accelerometer.bias_time",),
-        lambda scene: bool(scene.vehicle.imu and not scene.vehicle.imu.accelerometer.bias_ug),
+        lambda scene: not scene.vehicle.imu.accelerometer.bias_ug,
         "the bias does not vary",
         "vehicle.imu.accelerometer.bias_ug above 0",
     ),
     Rule(
         ("motion.control.integral_rad_s",),
-        lambda scene: bool(scene.motion.control and scene.motion.control.law == "pd"),
+        lambda scene: scene.motion.control.law == "pd",
         "the law pd has no integral",
         "motion.control.law: pid",
     ),

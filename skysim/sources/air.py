@@ -1,7 +1,6 @@
 """The air over a site at a time: refraction, extinction, scintillation and seeing of stars and bodies."""
 
 import datetime
-from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 
@@ -20,6 +19,7 @@ from skysim.sources.catalog import Catalog
 from skysim.sources.photometry import (
     SUN,
     Band,
+    Curve,
     Reals,
     black_body_v0,
     complete_colors,
@@ -365,7 +365,7 @@ def mean_wavelength_m(band: Band) -> float:
     return float(mean_of(band, lambda wavelength_m: wavelength_m, temperature_k(*SUN)))
 
 
-def mean_of(band: Band, value: Callable[[Floats], Floats], kelvin: Floats) -> Floats:
+def mean_of(band: Band, value: Curve, kelvin: Floats) -> Floats:
     """Mean of a function f of the wavelength over black bodies' photo-electrons: int f n R / int n R."""
     total = band.integral(lambda wavelength_m: black_body_v0(wavelength_m, kelvin))
     weighted = band.integral(

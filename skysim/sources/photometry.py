@@ -55,6 +55,7 @@ SUN = (
 )  # B-V and V-I of a G2 star, the zero point of every instrumental magnitude
 kept = lru_cache(maxsize=64)  # for what scenes of one process share
 Reals = float | Floats  # one number, or an array of them
+Curve = Callable[[Floats], Floats]  # of wavelengths in m
 Spectrum = str | float  # of an LED: "white" or a file, or the peak wavelength in m
 
 
@@ -128,7 +129,7 @@ class Band:
         even = np.arange(math.ceil(first / STEP_M), math.floor(last / STEP_M) + 1) * STEP_M
         return np.union1d(even[(even > first) & (even < last)], self.wavelength_m)
 
-    def integral(self, spectrum: Callable[[Floats], Floats]) -> Floats:
+    def integral(self, spectrum: Curve) -> Floats:
         """Integral of a spectrum times the response over wavelength: trapezoidal rule on `grid_m`.
 
         Parameters
@@ -363,7 +364,7 @@ def led_chromatic(spectrum: Spectrum, band: Band, fwhm_m: float | None = None) -
     return chromatic_moments(band, lambda wavelength_m: power(wavelength_m) * wavelength_m)
 
 
-def chromatic_moments(band: Band, photons: Callable[[Floats], Floats]) -> Floats:
+def chromatic_moments(band: Band, photons: Curve) -> Floats:
     """Moments of the lens's chromatic shifts over a light's photo-electrons, and a quadrature of the lateral ones.
 
     The quadrature's K nodes and shares give the mean of polynomials of degree 2 K - 1 over the light, so an image made
@@ -488,9 +489,7 @@ def radiant_strength_e_s_sr(
     return np.asarray(intensity_w_sr, dtype=float) * electrons_per_joule
 
 
-def broad_spectrum(
-    spectrum: Spectrum, fwhm_m: float | None
-) -> tuple[Callable[[Floats], Floats], float]:
+def broad_spectrum(spectrum: Spectrum, fwhm_m: float | None) -> tuple[Curve, float]:
     """The power of an LED, not a line, per meter of wavelength to any scale, and its integral: a file's or `colored`.
 
     Features narrower than the steps of `Band.integral` are not resolved. Raises InputError for a file that is not a
@@ -503,7 +502,7 @@ def broad_spectrum(
     return measured.response_at, float(measured.integral(np.ones_like))
 
 
-def colored(peak_m: float, fwhm_m: float) -> Callable[[Floats], Floats]:
+def colored(peak_m: float, fwhm_m: float) -> Curve:
     """Gaussian spectrum of a colored LED, per meter of wavelength, with unit integral: sigma = FWHM / sqrt(8 ln 2)."""
     sigma_m = fwhm_m / FWHM_PER_SIGMA
     scale = 1 / (math.sqrt(2 * math.pi) * sigma_m)

@@ -35,9 +35,8 @@ DOME: Any = SimpleNamespace(
     name="mine",
     surface=Ellipsoid(np.zeros(3), np.full(3, RADIUS_M)),
     cap_deg=32.0,
-    leds=SimpleNamespace(id=np.array([7, 8, 9])),
-    led_m=LED_M,
-    led_radius_m=1e-3,
+    leds=SimpleNamespace(id=np.array([7, 8, 9]), xyz=LED_M),
+    light=SimpleNamespace(led=SimpleNamespace(disk_diameter_m=2e-3)),
 )
 POINT_MM = 25.4 / 72
 

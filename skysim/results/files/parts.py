@@ -254,17 +254,7 @@ class DomeDesign:
         self.surface = build_surface(light.surface)
         self.leds = design_leds(light, self.surface, Band.from_camera(scene.camera))
         # Boards stand out.
-        self.cap_deg = max(light.points.cap_deg, max_tilt_deg(self.led_m))
-
-    @property
-    def led_m(self) -> Floats:
-        """(N, 3) places of the LEDs."""
-        return self.leds.xyz
-
-    @property
-    def led_radius_m(self) -> float:
-        """Radius of an LED's disk."""
-        return self.light.led.disk_diameter_m / 2
+        self.cap_deg = max(light.points.cap_deg, max_tilt_deg(self.leds.xyz))
 
     def to_rim_m(self, place_m: Floats) -> Floats:
         """(N,) lengths along the surface from places to the cap's rim, on the mean meridian."""
@@ -333,12 +323,12 @@ def mounted(design: DomeDesign) -> Quantities:
             return {"tape": tape_m, **found}
         case PatchBoardsConfig():
             # A board's wire goes to its LED next to the rim.
-            length_m = nearest_m(design.to_rim_m(design.led_m), design.leds.id // HOLES)
+            length_m = nearest_m(design.to_rim_m(design.leds.xyz), design.leds.id // HOLES)
             boards = len(length_m)
             found = {"board": boards, "led": count, "mounting_board": boards}
         case _:
             # One by one, each in its hole, or at the rim with a fiber to its hole.
-            length_m = design.to_rim_m(design.led_m)
+            length_m = design.to_rim_m(design.leds.xyz)
             found = {"led": count, "mounting_led": count}
     line = "fiber" if layout.kind == "fibers" else "wire"
     return {**found, line: float(length_m.sum()), **electronics(design)}

@@ -171,14 +171,17 @@ def read_truth(path: Path) -> FrameTruth:
     """
     sources = read_table(path)
     quaternions = [f"{name}_xyzw" for name in ATTITUDES]
-    counts = dict.fromkeys(("frame", "t_mid_s", "exposure_s"), 1)
-    counts |= {**dict.fromkeys(quaternions, 4), "rate_cam_rad_s": 3}
-    numbers = {
+    frame, t_mid_s, exposure_s = (
+        header_numbers(path, sources.meta, key, 1)[0]
+        for key in ("frame", "t_mid_s", "exposure_s")
+    )
+    counts = {**dict.fromkeys(quaternions, 4), "rate_cam_rad_s": 3}
+    vectors = {
         key: np.array(header_numbers(path, sources.meta, key, count))
         for key, count in counts.items()
     }
     for key in quaternions:
-        if abs(np.linalg.norm(numbers[key]) - 1) > UNIT_NORM:
+        if abs(np.linalg.norm(vectors[key]) - 1) > UNIT_NORM:
             raise InputError(
                 path, f"{key} in the header is {sources.meta[key]}", "a unit quaternion"
             )
@@ -190,14 +193,7 @@ def read_truth(path: Path) -> FrameTruth:
             f"mid_utc in the header is {sources.meta.get('mid_utc')!r}",
             "a time; run the scene again",
         ) from None
-    return FrameTruth(
-        frame=int(numbers.pop("frame")[0]),
-        mid_utc=utc,
-        t_mid_s=float(numbers.pop("t_mid_s")[0]),
-        exposure_s=float(numbers.pop("exposure_s")[0]),
-        sources=sources,
-        **numbers,
-    )
+    return FrameTruth(int(frame), utc, t_mid_s, exposure_s, **vectors, sources=sources)
 
 
 # Write frames and their truth to a results folder, and clear an earlier run from it. Writes are

@@ -28,7 +28,7 @@ from skysim.results.files.parts import DomeDesign
 from skysim.simulation.lab import Lab
 from skysim.sources.dome.layouts.placing import project_from_bearing, tilts_rad
 from skysim.sources.dome.layouts.string import directions
-from skysim.sources.dome.surface import Surface, perpendicular
+from skysim.sources.dome.surface import Surface, circle_rad, perpendicular
 
 # A flat drawing in millimeters, as SVG to print and as DXF for a cutter.
 
@@ -153,11 +153,6 @@ def template(lab: Lab, ending: str) -> str:
     return TEMPLATES[ending](DomeDesign(lab.scene, "templates"))
 
 
-def at(surface: Surface, rays: Floats) -> Floats:
-    """(..., 3) points of the surface in these directions from the bearing. Raises InputError where it has ended."""
-    return project_from_bearing(surface, rays.reshape(-1, 3)).reshape(rays.shape)
-
-
 def length_m(points_m: Floats) -> Floats:
     """(...) lengths of polylines (..., K, 3)."""
     return lengths(np.diff(points_m, axis=-2)).sum(axis=-1)
@@ -170,14 +165,14 @@ def on_paper_m(surface: Surface, rays: Floats, meridian_rad: float) -> Floats:
     aside_rad = np.arcsin(np.clip(np.sin(tilt_rad) * np.sin(azimuth_rad), -1, 1))
     foot_rad = np.arctan2(np.sin(tilt_rad) * np.cos(azimuth_rad), np.cos(tilt_rad))
     steps = np.linspace(0, 1, STEPS + 1)
-    along = at(
+    along = project_from_bearing(
         surface,
-        directions(foot_rad[:, None] * steps, np.full((len(rays), STEPS + 1), meridian_rad)),
+        directions(foot_rad[:, None] * steps, meridian_rad),
     )
-    foot = directions(foot_rad, np.full(len(rays), meridian_rad))
+    foot = directions(foot_rad, meridian_rad)
     across = np.array([-math.sin(meridian_rad), math.cos(meridian_rad), 0.0])
     turn = aside_rad[:, None] * steps
-    perpendicular = at(
+    perpendicular = project_from_bearing(
         surface, np.cos(turn)[..., None] * foot[:, None] + np.sin(turn)[..., None] * across
     )
     x_m = np.sign(aside_rad) * length_m(perpendicular)
@@ -189,9 +184,7 @@ def gore_count(dome: DomeDesign, widest_m: float = MAX_WIDTH_M) -> int:
     """The least number of gores of which none is wider than a sheet, nor than MAX_WIDTH_M."""
     tilt_rad = np.radians(np.arange(1, dome.cap_deg + 1))
     azimuth_rad = np.radians(np.arange(0, 360, 10.0))
-    around_m = at(
-        dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
-    )
+    around_m = project_from_bearing(dome.surface, directions(tilt_rad[:, None], azimuth_rad))
     ring_m = float(np.hypot(around_m[..., 0], around_m[..., 1]).max())
     return max(LEAST_GORES, math.ceil(2 * math.pi * ring_m / min(widest_m, MAX_WIDTH_M)))
 
@@ -206,7 +199,7 @@ class Gore(NamedTuple):
 
 def gore(dome: DomeDesign, number: int, count: int) -> Gore:
     """Gore `number`, from 0, of `count`: outline, meridian, title, a circle and a number for each LED."""
-    rays = normalized(dome.led_m)
+    rays = normalized(dome.leds.xyz)
     turns = azimuths_rad(rays) * count / (2 * np.pi)
     own = np.rint(turns).astype(int) % count == number
     meridian_rad = 2 * math.pi / count * number
@@ -223,7 +216,7 @@ def gore(dome: DomeDesign, number: int, count: int) -> Gore:
         Polyline(outline_mm, closed=True),
         Polyline(meridian_mm, dashed=True),
         SheetText(x_mm - 12, y_mm - 2, 4.0, title),
-        *marks(dome.leds.id[own], leds_mm, 1e3 * dome.led_radius_m),
+        *marks(dome.leds.id[own], leds_mm, 1e3 * dome.light.led.disk_diameter_m / 2),
     ]
     return Gore(half_mm, length_mm, shapes)
 
@@ -293,11 +286,11 @@ def shell_obj(dome: DomeDesign) -> str:
     whose base is on the surface and whose tip points outward.
     """
     tilt_rad = np.radians(np.linspace(0, dome.cap_deg, RINGS + 1))[1:]
-    azimuth_rad = np.arange(SECTORS) * (2 * np.pi / SECTORS)
-    rings_m = at(
-        dome.surface, directions(*np.meshgrid(tilt_rad, azimuth_rad, indexing="ij"))
+    azimuth_rad = circle_rad(SECTORS)
+    rings_m = project_from_bearing(
+        dome.surface, directions(tilt_rad[:, None], azimuth_rad)
     ).reshape(-1, 3)
-    vertices_m = np.concatenate([at(dome.surface, UP[None]), rings_m])
+    vertices_m = np.concatenate([project_from_bearing(dome.surface, UP[None]), rings_m])
     lines = [
         f"# {dome.name}: inner surface and LEDs, mm from the bearing's center, z up",
         "o shell",
@@ -311,7 +304,7 @@ def shell_obj(dome: DomeDesign) -> str:
         high = 2 + (ring + 1) * SECTORS
         corners = zip(around + low, onward + low, onward + high, around + high, strict=True)
         lines += [f"f {a} {b} {c} {d}" for a, b, c, d in corners]
-    leds = zip(dome.leds.id, dome.led_m, dome.surface.inward(dome.led_m), strict=True)
+    leds = zip(dome.leds.id, dome.leds.xyz, dome.surface.inward(dome.leds.xyz), strict=True)
     for n, (number, place_m, inward) in enumerate(leds):
         # A face counts from the pyramid's first vertex, 1-based.
         first = len(vertices_m) + 4 * n + 1

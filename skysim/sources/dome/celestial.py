@@ -73,19 +73,15 @@ def project_stars(
     direction = lab_from_icrs.apply(star_sources.apparent(stars, config.epoch))
     above_horizon = direction[:, 2] > 0
     stars = stars.take(above_horizon)
-    # 2.
-    place_m = surface.meet(camera_m, direction[above_horizon])
-    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * lengths(place_m)
-    stars = stars.take(within)
-    place_m = place_m[within]
-    order = np.argsort(stars.v_mag, kind="stable")
-    stars = stars.take(order)
-    place_m = place_m[order]
     mag = stars.v_mag
     if config.brightness == "band":
         mag = synthetic_mag(stars.v_mag, stars.b_v, stars.v_i, band)
+    # 2.
+    place_m = surface.meet(camera_m, direction[above_horizon])
+    within = place_m[:, 2] >= np.cos(np.radians(config.cap_deg)) * lengths(place_m)
+    projected = taken(ProjectedStars(stars.hip, stars.v_mag, mag, place_m), within)
+    projected = taken(projected, np.argsort(projected.v_mag, kind="stable"))
     # 3.
-    projected = ProjectedStars(stars.hip, stars.v_mag, mag, place_m)
     selected = select_brightest(projected, config, led.disk_diameter_m)
     # 4.
     rays = normalized(selected.place_m - camera_m)

@@ -102,14 +102,14 @@ def wall_patches(wall: Surface, reflectance: float) -> Patches:
     """
     # The fraction of the sky that the wall fills gives the number of directions.
     share = max(
-        float(np.isfinite(wall.meet(np.zeros(3), spiral(2000))[:, 0]).mean()),
+        float(np.isfinite(wall.from_bearing(spiral(2000))[:, 0]).mean()),
         PATCHES / MAX_DIRECTIONS,
     )
     toward = spiral(round(PATCHES / share))
-    met = wall.meet(np.zeros(3), toward)
+    met = wall.from_bearing(toward)
     on_wall = np.isfinite(met[:, 0])
     place_m = met[on_wall]
-    normal = wall.inward(met[on_wall])
+    normal = wall.inward(place_m)
     cosine = -np.sum(toward[on_wall] * normal, axis=1)
     area_m2 = np.sum(place_m**2, axis=1) * (4 * np.pi / len(toward)) / cosine
     return Patches(place_m, normal, area_m2, np.full(len(area_m2), reflectance))

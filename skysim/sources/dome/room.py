@@ -174,11 +174,8 @@ def shell_m(
     )
     limit_rad = np.pi if ends else np.radians(cap_deg)
     tilt_rad = np.linspace(0, limit_rad, TILTS)
-    tilts, azimuths = (
-        grid.ravel() for grid in np.meshgrid(tilt_rad, azimuth_rad, indexing="ij")
-    )
-    met = meet(surface, tilts, azimuths)
-    on_shell = np.isfinite(met[:, 0]).reshape(TILTS, len(azimuth_rad))
+    met = meet(surface, tilt_rad[:, None], azimuth_rad)
+    on_shell = np.isfinite(met[..., 0])
     edges = []
     # 2. A neighbor that is not on the shell: above, or below.
     for step in (1, -1):
@@ -191,7 +188,7 @@ def shell_m(
         edges.append(
             find_edges(surface, tilt_rad[inner], tilt_rad[outer], azimuth_rad[column])
         )
-    points_m = np.concatenate([met[np.isfinite(met[:, 0])], *edges])
+    points_m = np.concatenate([met[on_shell], *edges])
     if not len(points_m):
         raise InputError(
             "light.room", "the dome has no shell within cap_deg", "a surface over the bearing"
@@ -201,8 +198,8 @@ def shell_m(
 
 
 def meet(surface: Surface, tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
-    """(N, 3) points where rays from the bearing meet the surface; NaN where they miss."""
-    return surface.meet(np.zeros(3), directions(tilt_rad, azimuth_rad))
+    """(..., 3) points where rays from the bearing meet the surface; NaN where they miss."""
+    return surface.from_bearing(directions(tilt_rad, azimuth_rad))
 
 
 def find_edges(

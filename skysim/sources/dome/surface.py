@@ -114,6 +114,10 @@ class Surface(ABC):
         within = self.within(start + distance[:, None] * along)
         return origin_m + np.where(within, distance, np.nan)[:, None] * rays
 
+    def from_bearing(self, rays: Floats) -> Floats:
+        """(..., 3) points where rays (..., 3) from the bearing's center leave the inside; NaN as in `meet`."""
+        return self.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
+
     def exit_m(self, origin_m: Floats, rays: Floats) -> Floats:
         """(N,) distances of rays in the lab's axes to the surface, or to its continuation beyond the rim."""
         return self.distance(*self.own_rays(origin_m, rays))
@@ -142,7 +146,7 @@ class Surface(ABC):
         sectors = circle_rad(SECTORS)
         rays = unit_vectors(ring_z[:, None], sectors).reshape(-1, 3)
         # Keep the rays that meet the surface within its rim.
-        met = self.meet(np.zeros(3), self.lab_from_own.apply(rays))
+        met = self.from_bearing(self.lab_from_own.apply(rays))
         return met[np.isfinite(met[:, 0])]
 
     def nearest_ellipsoid(self) -> FittedEllipsoid:
@@ -160,12 +164,12 @@ def circle_rad(count: int) -> Floats:
 
 
 def unit_vectors(z: Array, azimuth: Array) -> Floats:
-    """(..., 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y, (...,) each."""
+    """(..., 3) unit vectors at heights z = cos(angle from +z) and azimuths from +x toward +y; these are broadcast."""
     return around_z(np.sqrt(1 - z**2), azimuth, z)
 
 
-def directions(tilt_rad: Floats, azimuth_rad: Floats) -> Floats:
-    """(..., 3) unit vectors at angles from +z and azimuths from +x toward +y, (...,) each."""
+def directions(tilt_rad: Floats, azimuth_rad: Floats | float) -> Floats:
+    """(..., 3) unit vectors at angles from +z and azimuths from +x toward +y; these are broadcast."""
     return around_z(np.sin(tilt_rad), azimuth_rad, np.cos(tilt_rad))
 
 
@@ -542,7 +546,7 @@ def cap_area_m2(surface: Surface, cap_deg: float) -> float:
     cosine = (1 + least) / 2 + (1 - least) / 2 * node
     azimuth = circle_rad(AREA_SECTORS)
     rays = unit_vectors(cosine[:, None], azimuth).reshape(-1, 3)
-    place_m = surface.meet(np.zeros(3), rays)
+    place_m = surface.from_bearing(rays)
     met = np.isfinite(place_m[:, 0])
     place_m = place_m[met]
     rays = rays[met]

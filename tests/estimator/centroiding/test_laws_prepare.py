@@ -16,7 +16,7 @@ from tests.helpers.laws import SEEDS, law
 
 
 def blobs(box: list[int]) -> Blobs:
-    sky = Background(np.zeros((1, 1)), np.ones((1, 1)), 30)
+    sky = Background(np.zeros((1, 1)), np.ones((1, 1)))
     return Blobs(
         np.array([box]),
         np.array([[5.0, 5.0]]),
@@ -88,7 +88,7 @@ def lines(image: np.ndarray, centers_px: np.ndarray) -> Blobs:
     """Blobs at centers, whose boxes are small."""
     count = len(centers_px)
     low = np.rint(centers_px - 2).astype(int)
-    sky = Background(np.zeros((1, 1)), np.full((1, 1), 3.0), 400)
+    sky = Background(np.zeros((1, 1)), np.full((1, 1), 3.0))
     one = np.ones(count)
     box = np.concatenate([low, low + 4], axis=1)
     return Blobs(box, centers_px, one, one, one.astype(int), sky, np.zeros(count, int))

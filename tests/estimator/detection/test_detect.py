@@ -20,7 +20,7 @@ BINOMIAL = np.outer([1, 2, 1], [1, 2, 1]) / 16
 
 
 def flat_background(level: float) -> Background:
-    return Background(np.full((1, 1), level), np.ones((1, 1)), 64)
+    return Background(np.full((1, 1), level), np.ones((1, 1)))
 
 
 def field_of_stars(

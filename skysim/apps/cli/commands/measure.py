@@ -24,6 +24,7 @@ from skysim.apps.cli.options import (
     as_typed,
     command_line,
     complete_scene,
+    complete_yaml,
     given_options,
     load,
     output_folder,
@@ -272,8 +273,7 @@ def characterize(
 
 def complete_camera(incomplete: str) -> list[str]:
     """Names of camera presets, scenes and YAML files that begin with what was typed."""
-    names = [name for name in shipped_files(DATA / "cameras") if name.startswith(incomplete)]
-    return sorted({*names, *complete_scene(incomplete)})
+    return sorted({*complete_yaml(DATA / "cameras", incomplete), *complete_scene(incomplete)})
 
 
 class CameraGroup(TyperGroup):
@@ -414,7 +414,7 @@ def read_camera(
     ):
         problem, names = unknown_name("camera", name, known)
         raise InputError("", problem, f"{names}, or a .yaml file")
-    path = loader.preset_path(name) if name in loader.list_cameras() else loader.find(name)
+    path = shipped_files(loader.PRESETS).get(name) or loader.find(name)
     tree = loader.read(path)[0]
     alone = tree.keys() <= {"camera", "schema"} and isinstance(tree.get("camera"), dict)
     if values and not alone:

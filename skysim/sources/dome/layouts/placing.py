@@ -10,7 +10,15 @@ from scipy.spatial import cKDTree
 from skysim.core.constants import GOLDEN_ANGLE_RAD
 from skysim.core.errors import InputError
 from skysim.core.jit import jit
-from skysim.core.types import Floats, Ints, Sources, lengths, normalized, polar_rad
+from skysim.core.types import (
+    Floats,
+    Ints,
+    Sources,
+    homogeneous,
+    lengths,
+    normalized,
+    polar_rad,
+)
 from skysim.scene.sections.layouts import HOLES, DimmedConfig, LitConfig
 from skysim.scene.sections.leds import LedConfig
 from skysim.sources.dome.layouts.ambiguity import unique_levels
@@ -77,23 +85,22 @@ def led_sources(placed: PlacedLeds, led: LedConfig, band: Band, rng: Generator) 
     # Drawn last, so that all other numbers are the same without it.
     if any(one.color_scatter_m for one, _ in types):
         color = rng.standard_normal(count)
+    chromatic = None if band.chromatic is None else np.empty((count, 4 + 2 * NODES))
     for one, rows in types:
         if one.color_scatter_m:
             strength[rows] *= color_factors(one, band, color[rows])
+        if chromatic is not None:
+            chromatic[rows] = chromatic_of(one, band, color[rows])
     if led.aging:
         strength = strength * aging_factors(led.aging, rng.standard_normal(count))
-    chromatic = np.empty((count, 4 + 2 * NODES))
-    if band.chromatic is not None:
-        for one, rows in types:
-            chromatic[rows] = chromatic_of(one, band, color[rows])
     return Sources(
         id=placed.id if placed.number is None else placed.number,
-        place=np.column_stack([placed.place_m, np.ones(count)]),
+        place=homogeneous(placed.place_m, 1.0),
         normal=placed.normal,
         radius_m=np.full(count, led.disk_diameter_m / 2),
         **pulses._replace(strength=strength * pulses.strength)._asdict(),
         magnitude=placed.magnitude,
-        chromatic=chromatic if band.chromatic is not None else None,
+        chromatic=chromatic,
     )
 
 
@@ -168,8 +175,8 @@ def check_cap(keys: Sequence[str], directions: Floats, cap_deg: float) -> None:
 
 
 def project_from_bearing(surface: Surface, directions: Floats) -> Floats:
-    """(N, 3) points where rays from the bearing's center meet the surface. Raises InputError if one misses it."""
-    place_m = surface.meet(np.zeros(3), directions)
+    """(..., 3) points where rays from the bearing's center meet the surface. Raises InputError if one misses it."""
+    place_m = surface.from_bearing(directions)
     if np.isnan(place_m).any():
         raise InputError(
             "light.layout",
@@ -184,7 +191,7 @@ def largest_cap_deg(surface: Surface) -> float:
     tilt_deg = np.arange(0, 1800) / 10
     azimuth_rad = circle_rad(72)
     rays = directions(np.radians(tilt_deg)[:, None], azimuth_rad)
-    missed = np.isnan(surface.meet(np.zeros(3), rays.reshape(-1, 3))).reshape(rays.shape)
+    missed = np.isnan(surface.from_bearing(rays))
     met = np.logical_and.accumulate(~missed.any(axis=(1, 2)))
     return float(tilt_deg[met].max(initial=0.0))
 

@@ -141,7 +141,7 @@ def aside(surface: Surface, tape: Tape, at_m: Floats, sideways_m: Floats) -> Flo
     middle_m = np.clip(at_m, step_m, tape.length_m[-1] - step_m)
     along = tape.rays(middle_m + step_m) - tape.rays(middle_m - step_m)
     side = np.cross(surface.inward(place_m), along)
-    moved = place_m + sideways_m[:, None] * side / np.linalg.norm(side, axis=1, keepdims=True)
+    moved = place_m + sideways_m[:, None] * side / lengths(side)[:, None]
     return project_from_bearing(surface, moved)
 
 
@@ -150,7 +150,7 @@ def mean_meridian(surface: Surface, half_rad: float) -> Meridian:
     tilt_rad = np.linspace(0, half_rad, MERIDIAN_STEPS + 1)
     azimuth_rad = circle_rad(MERIDIANS)
     rays = directions(tilt_rad[:, None], azimuth_rad)
-    place_m = project_from_bearing(surface, rays.reshape(-1, 3)).reshape(rays.shape)
+    place_m = project_from_bearing(surface, rays)
     # Chords along the meridians and around the circles.
     step_m = lengths(np.diff(place_m, axis=0)).mean(axis=1)
     around_m = lengths(place_m - np.roll(place_m, 1, axis=1)).sum(axis=1)
