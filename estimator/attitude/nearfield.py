@@ -48,9 +48,8 @@ CONVERGED_RAD = 1e-13
 # dp/du, the derivative of a point with respect to its ray u; and by_rotation, (N, 3) derivative of the point's distance
 # along u with respect to the attitude, 0 where the method does not use the attitude to place the point
 Points = tuple[Floats, Floats, Floats, Floats | float]
-Solution = tuple[
-    Rotation, Floats
-]  # body_from_lab, and its (3, 3) covariance in body axes, rad^2
+# body_from_lab, and its (3, 3) covariance in body axes, rad^2.
+Solution = tuple[Rotation, Floats]
 
 
 def _from_points(
