@@ -20,9 +20,8 @@ from skysim.scene.scene import Scene
 from skysim.simulation.flight import Shot
 from skysim.simulation.lab import StarCamera
 
-Angles = tuple[
-    float, float, float
-]  # RA, Dec, roll, or roll, pitch, yaw of the vehicle, degrees
+# RA, Dec, roll, or roll, pitch, yaw of the vehicle, degrees.
+Angles = tuple[float, float, float]
 
 
 @frozen

@@ -112,9 +112,8 @@ WELL_E_UM2 = 900.0  # full well per square micrometer of the IMX264, the least o
 TRANSFER = "1 us"  # transfer time of a row of a charge-coupled device
 
 
-Assumption = tuple[
-    Any, str
-]  # a value that the data sheet does not state, and the reason for it
+# A value that the data sheet does not state, and the reason for it.
+Assumption = tuple[Any, str]
 
 
 class Question(NamedTuple):
