@@ -264,7 +264,12 @@ def centroids() -> list[dict[str, Any]]:
 
 def closed_loop() -> list[dict[str, Any]]:
     """SimSat on its wheels under control, against the clock, and against mj_step alone with the same model."""
-    lab = build_lab(loader.load("afit_simsat", {"exposure.frames": "3"}))
+    wheels = {
+        "vehicle.wheels": "{}",
+        "motion.control": "{actuators: wheels}",
+        "exposure.frames": "3",
+    }
+    lab = build_lab(loader.load("afit_simsat", wheels))
     model = lab.vehicle.model
     flown_s = lab.duration_s
 
