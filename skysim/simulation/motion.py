@@ -428,7 +428,7 @@ class Motion:
             mean_nm = disturbance.sum(axis=0) / len(control)
         # 4. Record before the motion advances, so that all columns of a row are of the same time.
         if self.keeps_history:
-            self.record(momentum, mean_nm)
+            self.record(steps // self.period_steps, mean_nm)
         # 5. Integration.
         for drive in self.drives:
             drive.apply(control, angles)
@@ -437,13 +437,11 @@ class Motion:
         if navigation:
             navigation.sample_imu(simulation.now_s, *self.last_knots(len(control)))
 
-    def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
-        """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
+    def record(self, periods: int, disturbance_nm: Floats) -> None:
+        """Record control periods of the same controls and mean disturbance (3,), before the motion advances."""
         row = Record(
-            recorded=True,
             torque_nm=self.flight_computer.control_torque_nm,
             disturbance_nm=disturbance_nm,
-            momentum_nms=momentum_nms,
             control=self.flight_computer.control,
             **self.readings,
         )
@@ -477,7 +475,7 @@ class Motion:
                 one = np.asarray(value)
                 count = math.ceil(simulation.last_step / self.period_steps)
                 self.rows[name] = np.zeros((count, *one.shape), one.dtype)
-            self.rows[name][number] = value
+            self.rows[name][number : number + periods] = value
 
     def telemetry(self) -> Telemetry:
         """The rows so far as Telemetry; there is no commanded attitude without a controller."""
@@ -486,16 +484,12 @@ class Motion:
         steps = np.arange(0, simulation.step, self.period_steps)
         states = simulation.states[steps]
         rows = {name: row[: len(steps)] for name, row in self.rows.items()}
-        nq = simulation.model.nq
+        nq = simulation.nq
         readings = {name: rows.pop(name) for name in self.readings}
-        # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
-        for k in np.flatnonzero(~rows.pop("recorded")):
-            rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
-                states[k, 1 : 1 + nq], states[k, 1 + nq :]
-            )
-            # Actuators without commands keep their readings.
-            for values in readings.values():
-                values[k] = values[k - 1]
+        momenta = [
+            self.flight_computer.momentum_nms(state[1 : 1 + nq], state[1 + nq :])
+            for state in states
+        ]
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals = states[:, 1 + vehicle.gimbals.qpos]
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
@@ -522,6 +516,7 @@ class Motion:
             wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
             gimbal_rad=gimbals,
             joints=states[:, 1 : 1 + nq].copy(),
+            momentum_nms=np.array(momenta),
             manipulability=cmgs.manipulability(gimbals, rotors)
             if isinstance(cmgs, CmgActuator)
             else None,

@@ -238,12 +238,10 @@ class PrescribedMotion(Simulation):
         """Advance one step for each row of control (K, nu); its values have no effect."""
         self.discard_old(len(control))
         # Only attitude and rate change.
-        rate_column = 1 + self.nq
         for _ in range(len(control)):
-            state = self.states[self.row + 1]
-            state[:] = self.states[self.row]
+            self.states[self.row + 1] = self.states[self.row]
             self.step += 1
-            state[1:5], state[rate_column : rate_column + 3], _ = self.state_at(self.now_s)
+            self.lab_from_body_wxyz[:], self.rate_body_rad_s[:], _ = self.state_at(self.now_s)
 
 
 def simulate(
