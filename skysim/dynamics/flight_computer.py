@@ -187,7 +187,7 @@ class FlightComputer:
         commands
             What replaces the control law
         """
-        self.control = control = np.zeros(len(self.control))
+        self.control = control = np.zeros_like(self.control)
         # 1. Control law, unless its torque or its actuators are commanded.
         torque_nm = commands.torque_nm
         has_law = (

@@ -486,10 +486,6 @@ class Motion:
         rows = {name: row[: len(steps)] for name, row in self.rows.items()}
         nq = simulation.nq
         readings = {name: rows.pop(name) for name in self.readings}
-        momenta = [
-            self.flight_computer.momentum_nms(state[1 : 1 + nq], state[1 + nq :])
-            for state in states
-        ]
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals = states[:, 1 + vehicle.gimbals.qpos]
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
@@ -516,7 +512,12 @@ class Motion:
             wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
             gimbal_rad=gimbals,
             joints=states[:, 1 : 1 + nq].copy(),
-            momentum_nms=np.array(momenta),
+            momentum_nms=np.array(
+                [
+                    self.flight_computer.momentum_nms(state[1 : 1 + nq], state[1 + nq :])
+                    for state in states
+                ]
+            ),
             manipulability=cmgs.manipulability(gimbals, rotors)
             if isinstance(cmgs, CmgActuator)
             else None,

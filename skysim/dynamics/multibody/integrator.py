@@ -205,8 +205,8 @@ class Simulation:
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
         """Times (K,), attitudes lab_from_body_wxyz (K, 4) and rates (K, 3) in body axes, from step begin on."""
         states = self.states[begin - self.first_step : self.row + 1]
-        nq = self.nq
-        return self.times_s(begin, self.step + 1), states[:, 1:5], states[:, 1 + nq : 4 + nq]
+        rates = states[:, 1 + self.nq : 4 + self.nq]
+        return self.times_s(begin, self.step + 1), states[:, 1:5], rates
 
     def trajectory(self, begin: int = 0) -> Trajectory:
         """The motion from step begin on, as a Trajectory."""
