@@ -1,6 +1,9 @@
-"""The tracker's compilation in a second process reaches every stage of it."""
+"""The tracker's compilation in a second process reaches every stage of it; the order of loading changes nothing."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
 
 import pytest
 
@@ -27,3 +30,38 @@ def test_the_synthetic_frame_is_solved(name: str) -> None:
         build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
     )
     assert report.attitude.status == "solved"
+
+
+# With a second argument the functions that draw images are loaded from numba's cache before others that call them.
+EXPOSE = """
+import sys
+from skysim.camera.psf import ellipse, splat
+from skysim.scene import loader
+from skysim.simulation.flight import open_flight
+
+if sys.argv[2:]:
+    kernels = [one for part in (splat, ellipse) for one in vars(part).values() if hasattr(one, "py_func")]
+    for kernel in kernels:
+        for signature, *_ in kernel._cache._cache_file._load_index():
+            kernel.compile(signature)
+    assert sum(len(kernel.signatures) for kernel in kernels) > 5
+(shot,) = open_flight(loader.load(sys.argv[1], {"exposure.frames": "1"})).shots(solves=False)
+print(shot.truth.sources.electrons.tobytes().hex(), shot.frame.image_dn.sum())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["afit_simsat", "shefex2"])
+def test_a_frame_does_not_depend_on_the_functions_that_are_loaded_first(name: str) -> None:
+    """A function is compiled again into each that calls it, and the copy that is loaded first serves all.
+
+    The copies are optimized once and twice, so they must round alike.
+    """
+    plain, first = (
+        subprocess.run(
+            [sys.executable, "-c", EXPOSE, name, *words], capture_output=True, text=True
+        )
+        for words in ([], ["first"])
+    )
+    assert not plain.returncode, plain.stderr
+    assert first.stdout == plain.stdout, first.stderr
