@@ -13,6 +13,8 @@ from skysim.core import errors
 
 # No wrapper for C callbacks is compiled, since no compiled function is passed as a value.
 # Division by zero gives inf or nan, as in NumPy; sums are not reordered unless a function sets fastmath itself.
+# A function is compiled again into each that calls it, and of these copies the one that is loaded first serves all.
+# Fastmath may round them differently, so that a frame would depend on what was compiled and what came from the cache.
 jit = partial(
     numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True
 )

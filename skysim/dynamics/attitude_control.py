@@ -78,8 +78,6 @@ class Pid:
         config = config or ControlConfig()
         self.reference = reference
         self.inertia_kg_m2 = inertia_kg_m2
-        self.authority_nm = authority_nm
-        self.rate_limit_rad_s = rate_limit_rad_s
         # The gains are the coefficients of the expanded polynomial.
         b = config.bandwidth_rad_s
         z = config.damping
@@ -87,6 +85,7 @@ class Pid:
         self.kp = b**2 + 2 * z * b * p
         self.ki = b**2 * p
         self.kd = 2 * z * b + p
+        self.gains = self.kp, self.ki, self.kd, authority_nm, rate_limit_rad_s
         self.limited = False
         self.error_rad = np.zeros(3)
         self.error_sum_rad_s = np.zeros(3)
@@ -99,14 +98,14 @@ class Pid:
         momentum_nms: Floats,
     ) -> Floats:
         """(3,) torque commanded at t_s, which is held until the next call."""
-        gains = self.kp, self.ki, self.kd, self.authority_nm, self.rate_limit_rad_s
-        self.error_rad, torque_nm, self.limited = pid_torque(
+        torque_nm, self.limited = pid_torque(
             self.reference.state_at(t_s),
             (lab_from_body_wxyz, rate_body_rad_s),
             self.error_sum_rad_s,
             self.inertia_kg_m2,
             momentum_nms,
-            gains,
+            self.gains,
+            self.error_rad,
         )
         return torque_nm
 
@@ -130,8 +129,9 @@ def pid_torque(
     inertia: Floats,
     momentum: Floats,
     gains: tuple[float, float, float, float, float],
-) -> tuple[Floats, Floats, bool]:
-    """Attitude error (3,) and torque (3,) by steps 1 to 3 of `Pid`, and whether step 2 limited the feedback.
+    error: Floats,
+) -> tuple[Floats, bool]:
+    """Torque (3,) by steps 1 to 3 of `Pid`, and whether step 2 limited the feedback.
 
     Parameters
     ----------
@@ -147,13 +147,15 @@ def pid_torque(
         (3,) momentum stored in wheels and CMGs
     gains
         kp, ki, kd, authority in N m, rate limit in rad/s
+    error
+        (3,) attitude error, set in place
     """
     lab_from_ref, rate_ref, accel_ref = reference
     lab_from_body, rate = state
     kp, ki, kd, authority, rate_limit = gains
     # 1. Errors. e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
-    error = -to_rotvec(body_from_ref)
+    error[:] = -to_rotvec(body_from_ref)
     # The reference's rate and acceleration are in its own axes.
     rate_error = rate - apply(body_from_ref, rate_ref)
     # 2. Limit the return rate.
@@ -172,7 +174,7 @@ def pid_torque(
     # 3. Euler's equation, with the gyroscopic torque of the body and of the stored momentum.
     acceleration = apply(body_from_ref, accel_ref) - feedback - kd * rate_error
     gyroscopic = cross(rate, matrix_vector(inertia, rate) + momentum)
-    return error, matrix_vector(inertia, acceleration) + gyroscopic, limited
+    return matrix_vector(inertia, acceleration) + gyroscopic, limited
 
 
 @jit

@@ -9,7 +9,6 @@
 The cable's spring and the air drag depend on the state within a step. MuJoCo computes them (multibody/model.py).
 """
 
-import itertools
 import math
 
 import numpy as np
@@ -179,10 +178,8 @@ class DisturbanceModel:
                 and times_s[0] < impulse.begin_s + impulse.duration_s
             ):
                 # The fraction of the impulse in a step over the step's length is the mean torque of a unit impulse.
-                mean_per_impulse = [
-                    impulse.fraction(a, b) / (b - a) for a, b in itertools.pairwise(times_s)
-                ]
+                given = impulse.fraction(times_s[:-1], times_s[1:])
                 torque_nm += np.outer(
-                    mean_per_impulse, self.inertia_kg_m2 @ impulse.rate_rad_s
+                    given / np.diff(times_s), self.inertia_kg_m2 @ impulse.rate_rad_s
                 )
         return torque_nm

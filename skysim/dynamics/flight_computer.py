@@ -12,7 +12,6 @@ Another program may replace the law by a torque, or single motors' commands (`Co
 
 import math
 from collections.abc import Mapping
-from functools import reduce
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -79,16 +78,18 @@ class FlightComputer:
         Control period
     actuator_sets
         All actuators that are switched on, by their key in `vehicle`, and `ideal`
+    stores
+        Those that store momentum
     actuator
         Actuators that receive the control torque
-    nu
-        Number of controls of the MuJoCo model
     control_torque_nm
         (3,) control torque of the last period in body axes; zeros without a controller
     achieved_nm
         (3,) torque in body axes that actuators and fans give in the last period
-    names, loads
-        Names of the n commanded motors, and their commands, or speeds, in the last period relative to their limits (n,)
+    control
+        (nu,) controls of the last period
+    names
+        Names of the n motors that the law commands
     momentum_dump
         Momentum dumping; None if it is off
     """
@@ -103,11 +104,13 @@ class FlightComputer:
         self.config = None if scene.motion.is_prescribed else scene.motion.control
         self.period_s = 1 / scene.control_rate_hz
         self.actuator_sets = build_actuators(scene.vehicle, vehicle)
-        self.nu = vehicle.model.nu
+        self.stores = [
+            one for one in self.actuator_sets.values() if hasattr(one, "momentum_nms")
+        ]
+        self.control = np.zeros(vehicle.model.nu)
         self.control_torque_nm = np.zeros(3)
         self.achieved_nm = np.zeros(3)
         self.names: list[str] = []
-        self.loads = np.empty(0)
         self.momentum_dump: MomentumDump | None = None
         self.actuator = self.actuator_sets["ideal"]
         if self.config is None:
@@ -159,8 +162,10 @@ class FlightComputer:
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """(3,) momentum stored in wheels and CMGs, in body axes; the arguments are the full qpos and qvel."""
-        sets = self.actuator_sets.values()
-        return reduce(np.add, [one.momentum_nms(angles_rad, speeds_rad_s) for one in sets])
+        stored_nms = np.zeros(3)
+        for one in self.stores:
+            stored_nms += one.momentum_nms(angles_rad, speeds_rad_s)
+        return stored_nms
 
     def compute_controls(
         self,
@@ -182,17 +187,17 @@ class FlightComputer:
         commands
             What replaces the control law
         """
-        control = np.zeros(self.nu)
+        self.control = control = np.zeros_like(self.control)
         # 1. Control law, unless its torque or its actuators are commanded.
         torque_nm = commands.torque_nm
         has_law = (
             self.config and torque_nm is None and self.config.actuators not in commands.motors
         )
-        self.control_torque_nm = np.zeros(3) if torque_nm is None else torque_nm
         if has_law:
-            self.control_torque_nm = self.law.torque_nm(
+            torque_nm = self.law.torque_nm(
                 inputs.t_s, lab_from_body_wxyz, inputs.rate_body_rad_s, momentum_nms
             )
+        self.control_torque_nm = np.zeros(3) if torque_nm is None else torque_nm
         # 2. The actuators hold the body against the fans, which takes momentum out of them.
         dump_nm = np.zeros(3)
         if self.momentum_dump:
@@ -203,16 +208,23 @@ class FlightComputer:
         self.achieved_nm = achieved_nm + dump_nm
         for key, motor_commands in commands.motors.items():
             self.actuator_sets[key].command(control, motor_commands, inputs)
-        if self.names:
-            self.loads = np.abs(control[self.actuator.motor]) / self.actuator.limit
-            if isinstance(self.actuator, WheelActuator):
-                # The speed of a wheel counts if it is closer to its limit.
-                speeds = np.abs(inputs.speeds_rad_s[self.actuator.hinges.dof])
-                self.loads = np.maximum(self.loads, speeds / self.actuator.speed_limit_rad_s)
         # 4. Anti-windup.
         if has_law:
             self.law.integrate(actuator_torque_nm, achieved_nm, self.period_s)
         return control
+
+    def loads(self, control: Floats, speeds_rad_s: Floats) -> dict[str, Floats]:
+        """Commands of the law's motors by name, or their speeds, relative to their limits.
+
+        They are those of the controls (..., nu) and the full qvel (..., nv).
+        """
+        actuator = self.actuator
+        loads = np.abs(control[..., actuator.motor]) / actuator.limit
+        if isinstance(actuator, WheelActuator):
+            # The speed of a wheel counts if it is closer to its limit.
+            speeds = np.abs(speeds_rad_s[..., actuator.hinges.dof])
+            loads = np.maximum(loads, speeds / actuator.speed_limit_rad_s)
+        return dict(zip(self.names, loads.T, strict=False))
 
 
 def return_rate_limit_rad_s(scene: Scene) -> float:

@@ -495,14 +495,13 @@ class Impulse:
     duration_s: float
     rate_rad_s: Floats
 
-    def fraction(self, from_s: float, to_s: float) -> float:
-        """Fraction of the impulse between two times: (cos(pi a) - cos(pi b)) / 2, a and b in durations."""
-        # Times in durations, limited to the impulse.
+    def fraction(self, from_s: Any, to_s: Any) -> Any:
+        """Fraction of the impulse between two times, or (N,) between pairs: (cos(pi a) - cos(pi b)) / 2."""
+        # a and b are the times in durations, limited to the impulse.
         a, b = (
-            min(max((t_s - self.begin_s) / self.duration_s, 0.0), 1.0)
-            for t_s in (from_s, to_s)
+            np.clip((t_s - self.begin_s) / self.duration_s, 0, 1) for t_s in (from_s, to_s)
         )
-        return (math.cos(math.pi * a) - math.cos(math.pi * b)) / 2
+        return (np.cos(np.pi * a) - np.cos(np.pi * b)) / 2
 
 
 def impulses(motion: MotionConfig, reference: Reference) -> tuple[Impulse, ...]:

@@ -1,9 +1,9 @@
 """A lab in flight: its motion, the exposures of its cameras as they become due, and the recorded telemetry.
 
-`Flight.events` is the closed loop. Every control period:
+`Flight.events` is the closed loop:
 
-1. `Flight.advance`: the flight computer reads the true or the estimated attitude and sets the actuators, MuJoCo
-   integrates the equations of motion, and the IMU samples the motion (motion.py).
+1. `Flight.advance`: every control period the flight computer reads the true or the estimated attitude and sets the
+   actuators, MuJoCo integrates the equations of motion, and the IMU samples the motion (motion.py).
 2. `Flight.capture_due`: a frame is rendered once, when its exposure and its latency have passed. It is solved.
 3. With a filter the solution updates the attitude that the controller may use in the next period.
 """
@@ -44,6 +44,7 @@ from skysim.tracking.factory import ExposureController
 
 # Index of the first frame outside of the schedule. The index of a frame selects its noise.
 FIRST_OBSERVATION = 1_000_000
+BATCH = 10  # control periods between two looks at the schedules
 
 Progress = Callable[[float, float], None]
 FrameSelector = Callable[[int, float], bool]
@@ -366,17 +367,21 @@ class Flight:
         return self
 
     def advance(self, schedules: Sequence[Schedule]) -> None:
-        """Simulate one control period; if nothing depends on the motion, all periods to the next due frame."""
+        """Simulate the control periods to the next due frame, BATCH at most unless nothing depends on the motion."""
         motion = self.motion
-        periods = 1
+        due_s = min((one.due_s for one in schedules if not one.is_over), default=math.inf)
         if motion.is_free:
-            due_s = min((one.due_s for one in schedules if not one.is_over), default=math.inf)
             left_s = min(due_s, self.duration_s) - self.now_s
             if not motion.keeps_history:
                 # No more than there is room for.
                 left_s = min(left_s, self.lab.history_s)
             periods = max(math.ceil(left_s / motion.flight_computer.period_s), 1)
-        motion.advance(periods * motion.period_steps)
+            motion.advance(periods * motion.period_steps)
+            return
+        for _ in range(BATCH):
+            motion.advance(motion.period_steps)
+            if self.is_over or self.now_s >= due_s:
+                return
 
     @property
     def filter_schedules(self) -> list[Schedule]:
@@ -436,7 +441,7 @@ class Flight:
             selects(index, close_s) says whether to render a frame of the main camera. A skipped frame does not
             change the others, except that exposure control and filter do not see it
         progress
-            Called as progress(t_s, duration_s) after every step of the motion
+            Called as progress(t_s, duration_s) after every frame and every BATCH control periods
         """
         wanted = [one for one in self.schedules if cameras is None or one.number in cameras]
         shown = [one.camera for one in wanted]
@@ -452,7 +457,7 @@ class Flight:
         progress: Progress | None = None,
         captures_late: bool = True,
     ) -> Iterator[Shot | None]:
-        """Yield the shots of some cameras as in `shots`, and None after every step of the motion.
+        """Yield the shots of some cameras as in `shots`, and None after every call of `advance`.
 
         Parameters
         ----------

@@ -371,11 +371,10 @@ class Lab:
         """(3,) rate of the vehicle at the start, in body axes."""
         return guidance.body_rate_rad_s(self.scene, self.start, self.profiles)
 
-    @property
-    def vibration(self) -> Vibration:
-        """The vibration of the run, with that of its maneuvers."""
+    def vibration(self, reference: guidance.Reference) -> Vibration:
+        """The vibration of the run, with that of the maneuvers of its reference."""
         rng = random_stream(self.scene.seed, JITTER, 0)
-        return Vibration(self.scene.motion, rng, self.reference)
+        return Vibration(self.scene.motion, rng, reference)
 
     def in_run(self, seed: int) -> "Lab":
         """The same hardware in the run of another seed: other noise, vibration, timing, and phases of LED clocks."""

@@ -60,7 +60,6 @@ def check_reference(lab: Lab, reference: Reference, duration_s: float) -> None:
     check_tilt(reference, vehicle, 0.0 if motion.control is None else duration_s)
     if motion.control is None:
         return
-    actuators = build_actuators(vehicle, lab.vehicle)
     legs = zip(reference.legs, reference.start_s, motion.maneuver, strict=False)
     for n, (leg, begin_s, element) in enumerate(legs):
         if element.kind not in ("profile", "chirp"):
@@ -80,7 +79,8 @@ def check_reference(lab: Lab, reference: Reference, duration_s: float) -> None:
         if not motion.is_prescribed:
             inertia = lab.vehicle.inertia_kg_m2
             torque_nm = acceleration @ inertia.T + np.cross(rate, rate @ inertia.T)
-            used = usage(actuators[motion.control.actuators], torque_nm)
+            actuators = build_actuators(vehicle, lab.vehicle)[motion.control.actuators]
+            used = usage(actuators, torque_nm)
             k = int(used.argmax())
             if used[k] > 1 + ROUNDING:
                 raise InputError(
@@ -338,13 +338,13 @@ class Motion:
         check_reference(lab, self.reference, duration_s)
         if scene.motion.is_prescribed:
             self.simulation: Simulation = multibody.PrescribedMotion(
-                vehicle, lambda t_s: self.reference.state_at(t_s)[:2], duration_s, kept_s
+                vehicle, self.reference.state_at, duration_s, kept_s
             )
         else:
             self.simulation = multibody.Simulation(
                 vehicle, lab.start, lab.start_rate_rad_s, duration_s, kept_s
             )
-        self.vibration = lab.vibration
+        self.vibration = lab.vibration(self.reference)
         if kept_s is None:
             # This raises InputError for too many samples before any long work.
             self.vibration.subdivisions(
@@ -417,7 +417,8 @@ class Motion:
             simulation.now_s, flight_computer.period_s, measured_rate, angles, speeds
         )
         held = flight_computer.compute_controls(inputs, measured_attitude, momentum, commands)
-        control = held[None].repeat(min(steps, simulation.steps_left), axis=0)
+        control = np.empty((min(steps, simulation.steps_left), len(held)))
+        control[:] = held
         # 3. Disturbances act through the model's ideal torque actuators. They change at every step; commands do not.
         mean_nm = np.zeros(3)
         if not (self.disturbances.inactive or self.lab.scene.motion.is_prescribed):
@@ -427,7 +428,7 @@ class Motion:
             mean_nm = disturbance.sum(axis=0) / len(control)
         # 4. Record before the motion advances, so that all columns of a row are of the same time.
         if self.keeps_history:
-            self.record(momentum, mean_nm)
+            self.record(steps // self.period_steps, mean_nm)
         # 5. Integration.
         for drive in self.drives:
             drive.apply(control, angles)
@@ -436,14 +437,12 @@ class Motion:
         if navigation:
             navigation.sample_imu(simulation.now_s, *self.last_knots(len(control)))
 
-    def record(self, momentum_nms: Floats, disturbance_nm: Floats) -> None:
-        """Record this control period, with its mean disturbance (3,), when the controls are set, before the motion."""
+    def record(self, periods: int, disturbance_nm: Floats) -> None:
+        """Record control periods of the same controls and mean disturbance (3,), before the motion advances."""
         row = Record(
-            recorded=True,
             torque_nm=self.flight_computer.control_torque_nm,
             disturbance_nm=disturbance_nm,
-            momentum_nms=momentum_nms,
-            loads=self.flight_computer.loads,
+            control=self.flight_computer.control,
             **self.readings,
         )
         simulation = self.simulation
@@ -476,7 +475,7 @@ class Motion:
                 one = np.asarray(value)
                 count = math.ceil(simulation.last_step / self.period_steps)
                 self.rows[name] = np.zeros((count, *one.shape), one.dtype)
-            self.rows[name][number] = value
+            self.rows[name][number : number + periods] = value
 
     def telemetry(self) -> Telemetry:
         """The rows so far as Telemetry; there is no commanded attitude without a controller."""
@@ -485,21 +484,13 @@ class Motion:
         steps = np.arange(0, simulation.step, self.period_steps)
         states = simulation.states[steps]
         rows = {name: row[: len(steps)] for name, row in self.rows.items()}
-        nq = simulation.model.nq
+        nq = simulation.nq
         readings = {name: rows.pop(name) for name in self.readings}
-        # Several control periods of a free motion are integrated at once, and only the first of them is recorded.
-        for k in np.flatnonzero(~rows.pop("recorded")):
-            rows["momentum_nms"][k] = self.flight_computer.momentum_nms(
-                states[k, 1 : 1 + nq], states[k, 1 + nq :]
-            )
-            # Actuators without commands keep their readings.
-            for values in readings.values():
-                values[k] = values[k - 1]
         cmgs = self.flight_computer.actuator_sets.get("cmgs")
         gimbals = states[:, 1 + vehicle.gimbals.qpos]
         rotors = states[:, 1 + nq + vehicle.rotors.dof]
         t_s = steps * np.float64(simulation.step_s)
-        rows["loads"] = dict(zip(self.flight_computer.names, rows["loads"].T, strict=True))
+        rows["loads"] = self.flight_computer.loads(rows.pop("control"), states[:, 1 + nq :])
         # The filter's mounting states (K, n, 2, 3); that of a head is relative to that of the main camera.
         states_rad = rows.pop("mountings", np.zeros(0))
         rows["mountings"] = {}
@@ -521,6 +512,12 @@ class Motion:
             wheel_rad_s=states[:, 1 + nq + vehicle.wheels.dof],
             gimbal_rad=gimbals,
             joints=states[:, 1 : 1 + nq].copy(),
+            momentum_nms=np.array(
+                [
+                    self.flight_computer.momentum_nms(state[1 : 1 + nq], state[1 + nq :])
+                    for state in states
+                ]
+            ),
             manipulability=cmgs.manipulability(gimbals, rotors)
             if isinstance(cmgs, CmgActuator)
             else None,

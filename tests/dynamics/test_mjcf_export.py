@@ -17,7 +17,7 @@ from skysim.core.types import Sources
 from skysim.dynamics import guidance, multibody
 from skysim.dynamics.multibody import mjcf_export, scene_picture
 from skysim.dynamics.multibody.integrator import Simulation
-from skysim.dynamics.multibody.mjcf import mujoco_warnings
+from skysim.dynamics.multibody.mjcf import MujocoWarnings
 from skysim.scene.loader import list_scenes, load
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import open_flight
@@ -107,7 +107,7 @@ def test_the_exported_laboratory_flies_like_the_stepped_model(start: str) -> Non
     control = 0.2 * np.sin(np.arange(model.nu))
     flight.advance(np.tile(control, (1000, 1)))
     data.ctrl = control
-    with mujoco_warnings() as warned:
+    with MujocoWarnings() as warned:
         mujoco.mj_step(model, data, 1000)
     assert not warned
     assert not any(warning.number for warning in data.warning)

@@ -701,14 +701,20 @@ def test_a_wheel_s_inertia_is_read_in_any_notation(tmp_path: Path, inertial: str
     assert made.wheels.inertia_kg_m2[0] == pytest.approx(0.0101, rel=1e-6)
 
 
-def test_an_unstable_flight_is_an_error_even_if_it_settles() -> None:
-    """MuJoCo puts the vehicle back to its start and forgets its warning with the next call."""
-    flight = multibody.Simulation(multibody.build(vehicle_config()), LEVEL, STILL, 0.1)
-    bad = np.full((10, 3), np.nan)
-    good = np.zeros((10, 3))
-    flight.advance(good)
-    with pytest.raises(InputError, match=r"MuJoCo warned before 0\.020 s"):
-        flight.advance(bad)
+@pytest.mark.parametrize(
+    ("wheels", "end_s"), [(None, "0.020"), ({"stiction": "1e-3 N m"}, "0.011")]
+)
+def test_an_unstable_flight_is_an_error_even_if_it_settles(
+    wheels: dict[str, str] | None, end_s: str
+) -> None:
+    """MuJoCo puts the vehicle back to its start and forgets its warning with the next call: a step, with stiction."""
+    vehicle = multibody.build(vehicle_config(wheels=wheels))
+    flight = multibody.Simulation(vehicle, LEVEL, STILL, 0.1)
+    control = np.zeros((10, vehicle.model.nu))
+    flight.advance(control)
+    control[0] = np.nan
+    with pytest.raises(InputError, match=rf"MuJoCo warned before {end_s} s"):
+        flight.advance(control)
 
 
 def test_a_camera_rolled_on_its_mount_turns_its_axes_and_keeps_its_place() -> None:

@@ -1,6 +1,9 @@
-"""The tracker's compilation in a second process reaches every stage of it."""
+"""The tracker's compilation in a second process reaches every stage of it; the order of loading changes nothing."""
 
 from __future__ import annotations
+
+import subprocess
+import sys
 
 import pytest
 
@@ -27,3 +30,41 @@ def test_the_synthetic_frame_is_solved(name: str) -> None:
         build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
     )
     assert report.attitude.status == "solved"
+
+
+# With a second argument functions with fastmath are loaded from numba's cache before those that call them.
+FLY = """
+import sys
+from skysim.scene import loader
+from skysim.simulation.flight import open_flight
+
+if sys.argv[2:]:
+    parts = [part for name, part in sorted(sys.modules.items()) if name.startswith(("skysim.", "estimator."))]
+    kernels = {one for part in parts for one in vars(part).values() if hasattr(one, "py_func")}
+    kernels = {one for one in kernels if one.targetoptions["fastmath"]}
+    for kernel in kernels:
+        for signature, *_ in kernel._cache._cache_file._load_index():
+            kernel.compile(signature)
+    assert sum(len(kernel.signatures) for kernel in kernels) > 5
+(shot,) = open_flight(loader.load(sys.argv[1], {"exposure.frames": "1"})).shots()
+attitude = shot.solution.attitude
+print(shot.truth.sources.electrons.tobytes().hex(), shot.frame.image_dn.sum())
+print(shot.solution.centroids.xy_px.tobytes().hex(), attitude.cam_from_ref.as_quat().tobytes().hex())
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["afit_simsat", "shefex2"])
+def test_a_frame_does_not_depend_on_the_functions_that_are_loaded_first(name: str) -> None:
+    """A function is compiled again into each that calls it, and the copy that is loaded first serves all.
+
+    The copies are optimized once and twice, so they must round alike.
+    """
+    plain, first = (
+        subprocess.run(
+            [sys.executable, "-c", FLY, name, *words], capture_output=True, text=True
+        )
+        for words in ([], ["first"])
+    )
+    assert not plain.returncode, plain.stderr
+    assert first.stdout == plain.stdout, first.stderr

@@ -204,7 +204,7 @@ def values_of(channel: str, flight: Flight, began_s: float) -> Record:
     navigation = flight.motion.navigation
     values: Record = {
         "torque_nm": computer.control_torque_nm,
-        "loads": dict(zip(computer.names, computer.loads.tolist(), strict=True)),
+        "loads": computer.loads(computer.control, flight.motion.simulation.speeds_rad_s),
     }
     if navigation:
         values["lab_from_imu_xyzw"] = np.roll(navigation.attitude_wxyz("imu"), -1)

@@ -159,7 +159,7 @@ class EllipseDisk(NamedTuple):
     odd: float
 
 
-@jit(fastmath=True)
+@jit
 def spectrum(disk: EllipseDisk, f: Singles, lens: Singles, bessel: Singles) -> Singles:
     """Spectra of a disk with its lens and blur: step 2 of the module.
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -43,7 +44,7 @@ class ControlInput(NamedTuple):
 class Actuators:
     """A set of n actuators of one kind: converts a torque (3,) on the body to entries of the controls (nu,).
 
-    It stores no momentum, and its torque is proportional to its commands. Kinds override what differs.
+    Its torque is proportional to its commands. Kinds override what differs.
 
     Attributes
     ----------
@@ -69,7 +70,7 @@ class Actuators:
 
         One factor scales all commands to the limit, which keeps the direction of the torque.
         """
-        return scale_to_limit(self.command_from_torque @ torque_nm, self.limit)
+        return scale_to_limit(self.command_from_torque.dot(torque_nm), self.limit)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
@@ -78,11 +79,8 @@ class Actuators:
 
     def torque(self, commands: Floats) -> Floats:
         """Torque (3,) on the body of commands (n,)."""
-        return self.torque_from_command @ commands
-
-    def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
-        """(3,) stored angular momentum, in body axes."""
-        return np.zeros(3)
+        # The operator takes twice as long for so few numbers.
+        return self.torque_from_command.dot(commands)
 
 
 class ActuatorDrive(Protocol):
@@ -177,16 +175,11 @@ class Hinges:
     """
 
     def __init__(self, model: Any, prefix: str) -> None:
-        data = at_zero(model)
-        # The diagonal of the joint-space inertia matrix is the inertia about each axis.
-        full = np.zeros((model.nv, model.nv))
-        mujoco.mj_fullM(model, data, full)
+        self.model = model
         self.names = tuple(sorted(all_names(model.joint, model.njnt, prefix)))
-        ids = np.array([model.joint(name).id for name in self.names], dtype=np.int64)
-        self.axes = data.xaxis[ids].T.copy()
-        self.qpos = model.jnt_qposadr[ids].astype(np.int64)
-        self.dof = model.jnt_dofadr[ids].astype(np.int64)
-        self.inertia_kg_m2 = full[self.dof, self.dof]
+        self.ids = np.array([model.joint(name).id for name in self.names], dtype=np.int64)
+        self.qpos = model.jnt_qposadr[self.ids].astype(np.int64)
+        self.dof = model.jnt_dofadr[self.ids].astype(np.int64)
         # A motor has the name of its joint; MuJoCo gives -1 for a name that does not exist.
         kind = mujoco.mjtObj.mjOBJ_ACTUATOR
         motor = [mujoco.mj_name2id(model, kind, name) for name in self.names]
@@ -194,6 +187,19 @@ class Hinges:
 
     def __len__(self) -> int:
         return len(self.names)
+
+    # The start of a flight needs only the numbers of the joints, and these two are as much work as the rest of it.
+
+    @cached_property
+    def axes(self) -> Floats:
+        return at_zero(self.model).xaxis[self.ids].T.copy()
+
+    @cached_property
+    def inertia_kg_m2(self) -> Floats:
+        # The diagonal of the joint-space inertia matrix is the inertia about each axis.
+        full = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, at_zero(self.model), full)
+        return full[self.dof, self.dof]
 
 
 def at_zero(model: Any) -> Any:

@@ -4,8 +4,7 @@ MuJoCo computes the multibody dynamics and integrates them by the fourth-order R
 (model.STEP_S). Controls are constant within each step. `Simulation.advance` does the following:
 
 1. Make room for the new states.
-2. Integrate one step for each row of controls.
-3. Raise an error if MuJoCo warned.
+2. Integrate one step for each row of controls; raise an error if MuJoCo warned.
 """
 
 import copy
@@ -19,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from skysim.core.errors import InputError
 from skysim.core.quaternion import to_rotation
 from skysim.core.types import Floats, Trajectory
-from skysim.dynamics.multibody.mjcf import mujoco_warnings
+from skysim.dynamics.multibody.mjcf import MujocoWarnings
 from skysim.dynamics.multibody.model import VehicleModel, set_start
 from skysim.dynamics.multibody.wheels import Stiction
 
@@ -74,7 +73,10 @@ class Simulation:
             # The friction of a wheel at rest is a parameter of the model.
             self.model = copy.copy(vehicle.model)
             self.stiction = Stiction(self.model, wheels)
+        # Attributes of MuJoCo's objects take longer to read than their values.
         self.step_s = float(self.model.opt.timestep)
+        self.nq = self.model.nq
+        self.nv = self.model.nv
         self.last_step = max(1, int(np.ceil(min(duration_s / self.step_s, MAX_STEPS) - 1e-6)))
         self.history_steps = (
             self.last_step if history_s is None else int(np.ceil(history_s / self.step_s))
@@ -117,12 +119,12 @@ class Simulation:
     @property
     def angles_rad(self) -> Floats:
         """(nq,) present qpos; `Hinges.qpos` has the indices of the joints."""
-        return self.states[self.row, 1 : 1 + self.model.nq]
+        return self.states[self.row, 1 : 1 + self.nq]
 
     @property
     def speeds_rad_s(self) -> Floats:
         """(nv,) present qvel; `Hinges.dof` has the indices of the joints."""
-        return self.states[self.row, 1 + self.model.nq :][: self.model.nv]
+        return self.states[self.row, 1 + self.nq : 1 + self.nq + self.nv]
 
     @property
     def row(self) -> int:
@@ -141,8 +143,7 @@ class Simulation:
     def advance(self, control: Floats) -> None:
         """Integrate one step for each row of control (K, nu). Raises InputError if MuJoCo warned.
 
-        MuJoCo resets an unstable model to its start and continues. The next call clears its warnings, so they are
-        checked after every call.
+        MuJoCo resets an unstable model to its start and continues.
         """
         # 1. Room.
         self.discard_old(len(control))
@@ -153,15 +154,13 @@ class Simulation:
             for row in control:
                 self.stiction.set_friction(row, self.speeds_rad_s, self.data.qacc[:3])
                 self.integrate(row[None])
-        # 3. Stability.
-        self.check_warnings()
 
     def integrate(self, control: Floats) -> None:
-        """Integrate one step for each row of control (K, nu) with MuJoCo's rollout."""
+        """Integrate one step for each row of control (K, nu) with MuJoCo's rollout. Raises InputError if it warned."""
         row = self.row
         end = self.row + len(control)
         # The warm start carries the solver's state over to this call.
-        with mujoco_warnings():
+        with MujocoWarnings() as warned:
             self.rollout.rollout(
                 [self.model],
                 [self.data],
@@ -174,6 +173,15 @@ class Simulation:
                 state=self.states[None, row + 1 : end + 1],
             )
         self.step += len(control)
+        if warned:
+            # The next call clears MuJoCo's own record.
+            kinds = np.flatnonzero(self.data.warning.number).tolist()
+            names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
+            raise InputError(
+                "motion",
+                f"not integrable at a step of {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
+                f" ({names}); check vehicle and motion.control for stiff, fast or NaN values",
+            )
 
     def required_torque_nm(
         self, angles_rad: Floats, speeds_rad_s: Floats, acceleration_rad_s2: Floats
@@ -190,17 +198,6 @@ class Simulation:
         mujoco.mj_inverse(self.model, data)
         return np.array(data.qfrc_inverse[:3])
 
-    def check_warnings(self) -> None:
-        """Raise InputError if the last call made MuJoCo warn."""
-        if self.data.warning.number.any():
-            kinds = np.flatnonzero(self.data.warning.number).tolist()
-            names = ", ".join(mujoco.mjtWarning(kind).name for kind in kinds)
-            raise InputError(
-                "motion",
-                f"not integrable at a step of {1e3 * self.step_s:g} ms: MuJoCo warned before {self.now_s:.3f} s"
-                f" ({names}); check vehicle and motion.control for stiff, fast or NaN values",
-            )
-
     def times_s(self, begin: int, end: int) -> Floats:
         """(end - begin,) times of the steps begin, ..., end - 1."""
         return np.arange(begin, end) * np.float64(self.step_s)
@@ -208,8 +205,8 @@ class Simulation:
     def knots(self, begin: int = 0) -> tuple[Floats, Floats, Floats]:
         """Times (K,), attitudes lab_from_body_wxyz (K, 4) and rates (K, 3) in body axes, from step begin on."""
         states = self.states[begin - self.first_step : self.row + 1]
-        nq = self.model.nq
-        return self.times_s(begin, self.step + 1), states[:, 1:5], states[:, 1 + nq : 4 + nq]
+        rates = states[:, 1 + self.nq : 4 + self.nq]
+        return self.times_s(begin, self.step + 1), states[:, 1:5], rates
 
     def trajectory(self, begin: int = 0) -> Trajectory:
         """The motion from step begin on, as a Trajectory."""
@@ -223,30 +220,28 @@ class PrescribedMotion(Simulation):
     Attributes
     ----------
     state_at
-        Function from the time in s to lab_from_body_wxyz (4,) and rate (3,) in body axes
+        Function from the time in s to lab_from_body_wxyz (4,), rate and acceleration (3,) in body axes
     """
 
     def __init__(
         self,
         vehicle: VehicleModel,
-        state_at: Callable[[float], tuple[Floats, Floats]],
+        state_at: Callable[[float], tuple[Floats, ...]],
         duration_s: float,
         history_s: float | None = None,
     ) -> None:
         self.state_at = state_at
-        wxyz, rate = state_at(0.0)
+        wxyz, rate, _ = state_at(0.0)
         super().__init__(vehicle, to_rotation(wxyz), rate, duration_s, history_s)
 
     def advance(self, control: Floats) -> None:
         """Advance one step for each row of control (K, nu); its values have no effect."""
         self.discard_old(len(control))
         # Only attitude and rate change.
-        rate_column = 1 + self.model.nq
         for _ in range(len(control)):
-            state = self.states[self.row + 1]
-            state[:] = self.states[self.row]
+            self.states[self.row + 1] = self.states[self.row]
             self.step += 1
-            state[1:5], state[rate_column : rate_column + 3] = self.state_at(self.now_s)
+            self.lab_from_body_wxyz[:], self.rate_body_rad_s[:], _ = self.state_at(self.now_s)
 
 
 def simulate(

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 from xml.etree import ElementTree
 
 import mujoco
@@ -278,16 +278,16 @@ def mujoco_errors(path: Path, problem: str) -> Iterator[None]:
         raise InputError(path, f"{problem}: {one_line(error)}") from error
 
 
-@contextmanager
-def mujoco_warnings() -> Iterator[list[str]]:
-    """Collect MuJoCo's warnings in a list; otherwise it prints them and appends them to a file where it runs."""
-    caught: list[str] = []
-    before = mujoco.get_mju_user_warning()
-    mujoco.set_mju_user_warning(caught.append)
-    try:
-        yield caught
-    finally:
-        mujoco.set_mju_user_warning(before)
+class MujocoWarnings(list[str]):
+    """MuJoCo's warnings in a `with` block; otherwise it prints them and appends them to a file where it runs."""
+
+    def __enter__(self) -> Self:
+        self.before = mujoco.get_mju_user_warning()
+        mujoco.set_mju_user_warning(self.append)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        mujoco.set_mju_user_warning(self.before)
 
 
 def one_line(error: Exception) -> str:

@@ -31,7 +31,7 @@ from skysim.core.types import (
     normalized,
 )
 from skysim.dynamics.multibody.integrator import Simulation
-from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
+from skysim.dynamics.multibody.mjcf import MujocoWarnings, compile_spec
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 from skysim.scene.scene import Scene
@@ -120,7 +120,7 @@ def mjcf(
     add_field(spec, mount, field_corners(scene.camera, mount, lab_from_body, inside))
     add_start(spec, Simulation(vehicle, lab_from_body, rate_rad_s, 0.0).data)
     # 4. Text.
-    with mujoco_warnings(), full_precision():
+    with MujocoWarnings(), full_precision():
         compile_spec(spec, SCENES / scene.vehicle.model)
         return shorten_colors(spec.to_xml())
 

@@ -53,7 +53,7 @@ from skysim.dynamics.multibody.mass import (
     tree_mass,
     unbalance,
 )
-from skysim.dynamics.multibody.mjcf import compile_spec, load, mujoco_errors, mujoco_warnings
+from skysim.dynamics.multibody.mjcf import MujocoWarnings, compile_spec, load, mujoco_errors
 from skysim.dynamics.multibody.thrusters import FAN, FANS, THRUSTER, THRUSTERS, Fans
 from skysim.dynamics.multibody.wheels import WHEEL, WHEELS
 from skysim.scene.sections.vehicle import VehicleConfig
@@ -279,7 +279,7 @@ class VehicleModel:
 def build(vehicle: VehicleConfig) -> VehicleModel:
     """The compiled vehicle with its actuators. Raises InputError for a file or section that makes no vehicle."""
     path = SCENES / vehicle.model
-    with mujoco_warnings():
+    with MujocoWarnings():
         spec, mass, trims = compose(vehicle, path)
         model = compile_spec(spec, path)
     return VehicleModel(

@@ -19,7 +19,7 @@ from skysim.core.jit import jit
 from skysim.core.paths import SCENES
 from skysim.core.types import Bools, Floats, Mount
 from skysim.dynamics.multibody.mass import CAMERA
-from skysim.dynamics.multibody.mjcf import compile_spec, mujoco_warnings
+from skysim.dynamics.multibody.mjcf import MujocoWarnings, compile_spec
 from skysim.dynamics.multibody.model import (
     VehicleModel,
     camera_mount,
@@ -59,7 +59,7 @@ class Obstacles:
     def __init__(self, vehicle: VehicleModel, mount: Mount | None = None) -> None:
         # 1. Model with the initial angles of wheels and gimbals.
         path = SCENES / vehicle.config.model
-        with mujoco_warnings():
+        with MujocoWarnings():
             spec, bus = load_at_origin(path)
             place_camera(spec, vehicle.config)
             bus.mocap = True  # the pose of a mocap body is set, not simulated

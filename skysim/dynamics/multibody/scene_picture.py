@@ -19,7 +19,7 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.files import atomic_file
 from skysim.core.guarded import GL_OFF, PYTHON
 from skysim.core.types import Array, Floats
-from skysim.dynamics.multibody.mjcf import mujoco_warnings, one_line
+from skysim.dynamics.multibody.mjcf import MujocoWarnings, one_line
 
 Picture = Array[np.uint8]
 
@@ -139,7 +139,7 @@ def render_task() -> None:
     """Main function of the rendering process: task as npz on stdin, raw pictures on stdout, errors on stderr."""
     with os.fdopen(os.dup(1), "wb") as out:
         os.dup2(2, 1)  # output of a driver to stdout must not reach the pictures
-        with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, mujoco_warnings():
+        with np.load(io.BytesIO(sys.stdin.buffer.read())) as task, MujocoWarnings():
             text = str(task["mjcf"])
             states = task["qpos"]
             width, height = task["size_px"].tolist()

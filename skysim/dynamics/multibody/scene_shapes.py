@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from skysim.core.types import Array, Floats
-from skysim.dynamics.multibody.mjcf import mujoco_warnings
+from skysim.dynamics.multibody.mjcf import MujocoWarnings
 from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN, mesh_arrays
 from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 
@@ -73,7 +73,7 @@ class Laboratory:
     """
 
     def __init__(self, mjcf: str) -> None:
-        with mujoco_warnings():
+        with MujocoWarnings():
             model = mujoco.MjModel.from_xml_string(mjcf)
             data = mujoco.MjData(model)
             mujoco.mj_kinematics(model, data)

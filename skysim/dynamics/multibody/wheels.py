@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from skysim.core.constants import RPM_RAD_S
+from skysim.core.jit import jit
 from skysim.core.types import Floats
 from skysim.dynamics.multibody.actuator_kind import (
     ActuatorKind,
@@ -63,15 +64,36 @@ class WheelActuator(Actuators):
 
         By inertia d(speed)/dt = u, without the body's own acceleration. A wheel at its limit can only be braked.
         """
-        speeds = inputs.speeds_rad_s[self.hinges.dof]
-        torque_per_speed = self.hinges.inertia_kg_m2 / inputs.period_s
-        upper = np.maximum(torque_per_speed * (self.speed_limit_rad_s - speeds), 0.0)
-        lower = np.minimum(-torque_per_speed * (self.speed_limit_rad_s + speeds), 0.0)
-        return super().command(control, np.clip(commands, lower, upper), inputs)
+        given = limit_torques(
+            commands,
+            inputs.speeds_rad_s[self.hinges.dof],
+            self.hinges.inertia_kg_m2 / inputs.period_s,
+            self.limit,
+            self.speed_limit_rad_s,
+        )
+        control[self.motor] = given
+        return self.torque(given)
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of the wheels relative to the body: h = sum axis inertia speed."""
-        return self.hinges.axes @ (self.hinges.inertia_kg_m2 * speeds_rad_s[self.hinges.dof])
+        return self.hinges.axes.dot(self.hinges.inertia_kg_m2 * speeds_rad_s[self.hinges.dof])
+
+
+@jit
+def limit_torques(
+    torques_nm: Floats,
+    speeds_rad_s: Floats,
+    torque_per_speed: Floats,
+    torque_limit_nm: float,
+    speed_limit_rad_s: float,
+) -> Floats:
+    """(n,) torques of the motors, clipped as in `WheelActuator.command`; torque_per_speed is inertia over period."""
+    given_nm = np.empty(len(torques_nm))
+    for n in range(len(torques_nm)):
+        upper = max(torque_per_speed[n] * (speed_limit_rad_s - speeds_rad_s[n]), 0.0)
+        lower = min(-torque_per_speed[n] * (speed_limit_rad_s + speeds_rad_s[n]), 0.0)
+        given_nm[n] = min(max(torques_nm[n], lower, -torque_limit_nm), upper, torque_limit_nm)
+    return given_nm
 
 
 class Stiction:

@@ -121,7 +121,7 @@ def jitter_in_exposures(lab: Lab, t_s: Floats, exposure_s: float) -> tuple[Float
 
     The rest is the rotation relative to one at the mean rate, K samples of zero mean, in body axes.
     """
-    vibration = lab.vibration
+    vibration = lab.vibration(lab.reference)
     if not vibration.components:
         return np.zeros((len(t_s), 3)), np.zeros((len(t_s), 1, 3))
     after_s = exposure_s * np.linspace(-0.5, 0.5, SAMPLES)

@@ -163,7 +163,9 @@ def test_commands_of_motors_replace_the_law_only_if_they_are_its_own() -> None:
     live.advance()
     np.testing.assert_array_equal(computer.control_torque_nm, 0)
     # Clipped to the limit.
-    np.testing.assert_allclose(computer.loads, 1.0)
+    speeds = live.flight.motion.simulation.speeds_rad_s
+    loads = computer.loads(computer.control, speeds)
+    np.testing.assert_allclose(list(loads.values()), 1.0)
 
 
 def test_a_trim_mass_is_moved_beside_the_law() -> None:
