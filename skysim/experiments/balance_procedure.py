@@ -194,7 +194,7 @@ def balance(
         )
         records.append(flown.record)
         with refusing(ImageError, "balance"):  # it does not converge
-            estimate = estimate_with_noise(records, assumptions.lab, assumptions.prior)
+            estimate = estimate_with_noise(records, assumptions.prior)
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
         if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
             position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
@@ -355,7 +355,7 @@ def draw_flights(fig: Any, statistics: Record, record: BearingRecord) -> None:
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
     """As `estimate_rows`, for the filter in flight at the end of one iteration. Raises InputError for few attitudes."""
     with refusing(ImageError, "balance"):
-        *_, last = filter_mass(one.flight.record, assumptions.lab, assumptions.prior)
+        *_, last = filter_mass(one.flight.record, assumptions.prior)
     return estimate_rows(one.flight, last)
 
 
