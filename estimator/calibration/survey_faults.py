@@ -57,13 +57,12 @@ class HeldFrames:
         apart_px
             Least distance from other LEDs, whose images may merge with it
         """
-        out = np.zeros((len(self.body_from_lab), len(self.leds.id)), dtype=bool)
+        rows = []
         size_px = np.array([self.camera.width_px, self.camera.height_px])
         margin = np.broadcast_to(margin_px, len(self.leds.id))[:, None]
-        for row, attitude in zip(out, self.body_from_lab, strict=True):
-            # An LED behind the camera is put far outside.
+        for attitude in self.body_from_lab:
+            # NaN for an LED behind the camera, which is outside everything.
             xy_px = project(attitude, self.leds.position_m, self.lever, self.camera)
-            xy_px = np.nan_to_num(xy_px, nan=-1e9)
             inside = ((xy_px >= margin) & (xy_px <= size_px - 1 - margin)).all(axis=1)
             # Distance to the nearest other LED, one outside the frame included
             around = (xy_px > -apart_px) & (xy_px < size_px + apart_px)
@@ -71,8 +70,8 @@ class HeldFrames:
             if len(near) > 1:
                 distance_px, _ = cKDTree(xy_px[near]).query(xy_px[near], 2)
                 inside[near[distance_px[:, 1] < apart_px]] = False
-            row[:] = inside
-        return out
+            rows.append(inside)
+        return np.array(rows)
 
     def rays(self, frame: Ints, xy_px: Floats) -> tuple[Floats, Floats]:
         """Return the (M, 3) origins and unit directions, in the lab, of the rays to pixels (M, 2) of frames (M,)."""
