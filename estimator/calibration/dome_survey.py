@@ -48,6 +48,7 @@ from estimator.calibration.survey_subset import (
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.vectors import rms
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
@@ -396,7 +397,7 @@ def _report(
         attitude_covariance_rad2=by_rotation,
         lever_covariance_m2=shared[:3, :3],
         lens_covariance=shared[3:, 3:],
-        rms_px=float(np.sqrt(np.mean(residual_px**2))),
+        rms_px=rms(residual_px),
         common_m=common_m,
         common_camera=common_camera,
         **quality,

@@ -42,6 +42,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
+from estimator.core.vectors import rms
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 # In a frame: two determine its attitude and leave only one coordinate for the lens
@@ -434,7 +435,7 @@ def _report(
         tied,
         outliers,
         len(sightings.frame),
-        rms_px=float(np.sqrt(np.mean(residual_px**2))),
+        rms_px=rms(residual_px),
         misfit=float(np.sqrt(np.sum(residual**2) / max(freedom, 1))),
         magnitude=zero,
     )

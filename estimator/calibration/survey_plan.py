@@ -24,6 +24,7 @@ from estimator.calibration.dome_survey import check_redundancy
 from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints, frozen
+from estimator.core.vectors import rms
 
 MIN_SHARED = 8  # least number of LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # least number of LEDs that determine an attitude
@@ -108,7 +109,7 @@ class SurveyAccuracy:
     @property
     def led_rms_m(self) -> float:
         """Root mean square of the errors of the measured LEDs along an axis."""
-        return float(np.sqrt(np.mean(self.led_sigma_m[self.measured] ** 2)))
+        return rms(self.led_sigma_m[self.measured])
 
 
 def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyAccuracy:

@@ -16,6 +16,11 @@ def normalized(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
+def rms(values: Floats) -> float:
+    """Return the root mean square of all values."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
 def rotation_of(xyzw: Floats) -> Rotation:
     """Return the rotation of a unit quaternion (4,): `Rotation.from_quat` without its checks, in a sixth of the time.
 

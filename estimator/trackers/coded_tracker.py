@@ -29,7 +29,6 @@ from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
 from estimator.trackers.pipeline import (
     Clock,
     Settings,
-    direction_sigma_rad,
 )
 
 COLLECTING = "codes: too few lights have been seen long enough"
@@ -250,7 +249,7 @@ class CodedTracker(DomeTracker):
         rays = self.camera.rays(centroids.xy_px)
         focal_px = self.camera.focal_px
         own = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings),
+            self.direction_sigma_rad(centroids),
             MIN_ERROR_PX / focal_px,
         )
         tangent = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)

@@ -38,7 +38,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.core.vectors import normalized
+from estimator.core.vectors import normalized, rms
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.direct_match import mutual_nearest
@@ -50,7 +50,6 @@ from estimator.trackers.pipeline import (
     FrameTracker,
     Settings,
     check_algorithms,
-    direction_sigma_rad,
     run_all_stages,
 )
 from estimator.trackers.rolling_shutter import Lights, solve_lights
@@ -269,7 +268,7 @@ class DomeTracker(FrameTracker):
     ) -> Attitude:
         """Identify and solve centroids of one time."""
         if self.settings.identifier in FITS_FOCAL:
-            sigma_rad = direction_sigma_rad(centroids, self.camera, self.settings)
+            sigma_rad = self.direction_sigma_rad(centroids)
         else:
             sigma_rad = self._pixel_rad(centroids)
         flux_s = centroids.flux / exposure_s if exposure_s else None
@@ -314,7 +313,7 @@ class DomeTracker(FrameTracker):
         observed = match.observed
         star = match.star
         rays = self.camera.rays(centroids.xy_px[observed])
-        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
+        pixel_rad = self.direction_sigma_rad(centroids)[observed]
         sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
         body_from_lab = self.lever.body_from_cam * match.cam_from_ref
         ratio = fit_focal_ratio(
@@ -342,7 +341,7 @@ class DomeTracker(FrameTracker):
     def _pixel_rad(self, centroids: Centroids) -> Floats:
         """Return the (N,) standard deviations of the directions, from the centroids and the focal length."""
         return np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings),
+            self.direction_sigma_rad(centroids),
             self._focal_rad(self.camera.rays(centroids.xy_px)),
         )
 
@@ -400,7 +399,7 @@ class DomeTracker(FrameTracker):
             cam_from_lab,
             covariance + lever_covariance,
             StarMatch(observed, star, cam_from_lab, match.log10_chance),
-            float(np.sqrt(np.mean(residual**2))),
+            rms(residual),
             self.camera,
             shared + lever_covariance,
             constant_rad2=lever_covariance,

@@ -32,7 +32,7 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.core.vectors import rotation_of
+from estimator.core.vectors import rms, rotation_of
 from estimator.identification import star_evidence, star_quads, star_search
 from estimator.identification.refusals import (
     BUDGET,
@@ -463,7 +463,7 @@ class StarTracker(FrameTracker):
             cam_from_ref.as_quat(),
             covariance(rays, np.sqrt(variance) * sigma_rad, solver),
             1.0,
-            float(np.sqrt(np.mean(residual_px**2))) / self.camera.focal_px,
+            rms(residual_px) / self.camera.focal_px,
             chi2,
             float("nan"),
         )
