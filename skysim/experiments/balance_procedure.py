@@ -54,7 +54,6 @@ from skysim.results.report import (
     Table,
     Text,
     Verdict,
-    text_column,
 )
 from skysim.results.telemetry_report import AXES, EULER, euler_deg
 from skysim.scene.scene import Scene
@@ -447,7 +446,7 @@ def offset_text(flight: Record) -> str:
 def mass_blocks(rows: Sequence[Record], trims: bool) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's, which may have trim masses."""
     heads = ("estimate", "1σ", "simulated vehicle")
-    columns = [text_column("what"), *(Column(head, format=".5g") for head in heads)]
+    columns = ["what", *(Column(head, format=".5g") for head in heads)]
     values = [[row[key] for key in ("what", "estimate", "sigma", "truth")] for row in rows]
     for row in values:
         # A true value far below the standard error is rounding.
