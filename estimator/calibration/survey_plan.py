@@ -75,6 +75,12 @@ class SurveyModel:
                     f"survey: {name} is {getattr(self, name)}; allowed: 0 or more"
                 )
 
+    @property
+    def assumed(self) -> Assumed:
+        """Lever and focal length, which enter an adjustment as measurements."""
+        arm_m = np.array(self.lever.camera_body_m)
+        return Assumed(arm_m, self.lever_sigma_m, self.camera.focal_px, self.focal_sigma_px)
+
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Bools:
         """Return (F, N) whether each LED is on the chip at each of F attitudes, at least `margin_px` from its edge."""
         rows = []
@@ -159,12 +165,9 @@ def _bundle(
     model: SurveyModel, body_from_lab: Rotation, seen: Bools
 ) -> tuple[Bundle, Sightings]:
     """Return the assumed model as a bundle, with sightings exactly where it predicts them."""
-    camera = model.camera
-    known = model.leds, model.lever, camera
+    known = model.leds, model.lever, model.camera
     start = Bundle.start(*known, body_from_lab, model.fit_distortion)
-    arm_m = start.camera_body_m
-    assumed = Assumed(arm_m, model.lever_sigma_m, camera.focal_px, model.focal_sigma_px)
-    bundle = replace(start, map_sigma_m=model.leds_sigma_m, assumed=assumed)
+    bundle = replace(start, map_sigma_m=model.leds_sigma_m, assumed=model.assumed)
     # With pixels of 0 the residuals are the negative predictions over sigma.
     frame, led = np.nonzero(seen)
     sightings = Sightings(
