@@ -85,8 +85,8 @@ class Analysis(NamedTuple):
         The answer in a few sentences
     headline
         All answers in words
-    ranges
-        Range of each response, in words
+    answers
+        These, and the range of each response, in words
     indices
         Sobol indices, for the design saltelli; shares of causes where the factors switch causes on and off
     result
@@ -101,16 +101,11 @@ class Analysis(NamedTuple):
     about: Overview
     verdict: str
     headline: Sequence[str]
-    ranges: Sequence[str]
+    answers: Sequence[str]
     indices: Sequence[Index]
     result: search.SearchResult | None
     pooled: Sequence[Block]
     judged: Sequence[Sequence[Judgment]]
-
-    @property
-    def answers(self) -> list[str]:
-        """All answers."""
-        return [*self.headline, *self.ranges]
 
 
 def study_report(plan: Plan, store: Store) -> Report:
@@ -171,7 +166,7 @@ def analyze(plan: Plan, store: Store, command: Command) -> Analysis:
         about,
         answer.verdict(answered, judged, about.survey_share),
         headline,
-        answer.ranges(answered),
+        [*headline, *answer.ranges(answered)],
         indices(plan, store) if sobol or switches_causes(study) else [],
         search.collect_result(plan, store) if study.optimize else None,
         pooled_blocks(plan, columns, command("replay")) if columns else (),
