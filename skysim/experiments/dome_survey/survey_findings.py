@@ -15,7 +15,7 @@ from estimator.calibration.bundle_adjustment import Sightings
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
-from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths
+from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths, median
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
     GATE_SIGMAS,
@@ -296,7 +296,7 @@ def find_faults(run: SurveyRun) -> Record:
         "displaced": {int(leds.id[row]): float(off_m[row]) for row in rows},
         "list_sigma_m": sigma_m,
         "tested": len(size_m),
-        "tested_m": float(np.median(size_m)) if len(size_m) else None,
+        "tested_m": median(size_m) if len(size_m) else None,
         "exchanged": [
             (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
             for x in exchanges

@@ -14,7 +14,7 @@ from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth, lengths
+from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth, lengths, median
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -312,7 +312,7 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> Record:
         "rms_px": survey.rms_px,
         "noise_px": run.noise_px,
         "misfit": survey.misfit,
-        "led_sigma_mm_median": float(np.median(sigma_mm)),
+        "led_sigma_mm_median": median(sigma_mm),
         "led_sigma_mm_worst": float(sigma_mm.max()),
         "values": rows_of_columns(
             what=PARAMETERS,

@@ -73,11 +73,9 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, optics, poses, ends)
     rate_e_s = rates_e_s(near, optics, camera.known.emitter, distance_m, cos_out, cos_in)
-    duty = near.duty
-    electrons = rate_e_s * duty * lab.scene.exposure.time_s
-    x, y = xy_px.T
-    width_px, height_px = camera.canvas.shape[::-1]
-    visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
+    electrons = rate_e_s * near.duty * lab.scene.exposure.time_s
+    size_px = np.array(camera.canvas.shape[::-1])
+    visible = np.all((xy_px > -0.5) & (xy_px < size_px - 0.5), axis=1)
     at_rest = Trajectory.at_rest(lab.start, MARGIN_S)
     start = exposure_of(camera, at_rest, 0, Window(0.0, 0.0), None)
     obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
