@@ -329,9 +329,9 @@ class EquationsOfMotion:
 
     def stored(self, t_s: Floats) -> Floats:
         """Return A (1 + e) h, (3, B): the momentum of the wheels at times (B,), in body axes."""
-        wheel_t_s = self.record.wheel_t_s
         measured = [
-            np.interp(t_s, wheel_t_s, one) for one in self.record.wheel_momentum_nms.T
+            np.interp(t_s, self.record.wheel_t_s, one)
+            for one in self.record.wheel_momentum_nms.T
         ]
         return self.axes @ (self.wheel_scale * np.array(measured))
 

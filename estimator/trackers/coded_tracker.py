@@ -247,10 +247,9 @@ class CodedTracker(DomeTracker):
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """Return the (K, 3) rays of centroids and the (K,) errors of their tangents, map and lever included."""
         rays = self.camera.rays(centroids.xy_px)
-        focal_px = self.camera.focal_px
         own = np.hypot(
             self.direction_sigma_rad(centroids),
-            MIN_ERROR_PX / focal_px,
+            MIN_ERROR_PX / self.camera.focal_px,
         )
         tangent = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
         lever = self.lever.sigma_m / self.sphere.radius_m.min() * tangent

@@ -252,8 +252,7 @@ class DomeTracker(FrameTracker):
         """
         Centroids.check_values(centroids)
         clock = clock or Clock()
-        lever_cam_m = self.lever.pupil_cam_m
-        lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
+        lights = Lights(self.leds.position_m, self.lever.pupil_cam_m, self._with_errors)
         solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
         return solve_lights(self.camera, lights, centroids, solve, rate, exposure_s)
 

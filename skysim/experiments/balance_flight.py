@@ -131,8 +131,9 @@ def draw_assumptions(
     sigma = np.append(inertia_sigma, np.repeat(rest, [3, 3, 1, 1, 3, count]))
     values = np.zeros(PARAMETERS + count)
     values[:6] = inertia_six(true_kg_m2) + inertia_sigma * rng.standard_normal(6)
-    wheels = at_zero.wheels.inertia_kg_m2
-    assumed_wheels = wheels / (1 + uncertainty.wheel_sigma * rng.standard_normal(count))
+    assumed_wheels = at_zero.wheels.inertia_kg_m2 / (
+        1 + uncertainty.wheel_sigma * rng.standard_normal(count)
+    )
     lab = known_lab(scene, at_zero, uncertainty)
     return Assumptions(Prior(values, sigma, lab), assumed_wheels)
 

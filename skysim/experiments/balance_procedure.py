@@ -272,7 +272,6 @@ def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -
 
 def flight_row(number: int, one: Iteration) -> Record:
     """Numbers of one flight; names that begin with `true` are of the simulated vehicle."""
-    trims = one.flight.vehicle.trims
     mass = one.flight.vehicle.mass
     per_um = 1e6 / mass.mass_kg
     return {
@@ -282,7 +281,7 @@ def flight_row(number: int, one: Iteration) -> Record:
         "solved": one.flight.solved,
         "after_contact": one.flight.after_contact,
         "tilt_deg": largest_tilt_deg([one.flight.record]),
-        "trim_mm": (1e3 * trims.position_m).tolist(),
+        "trim_mm": (1e3 * one.flight.vehicle.trims.position_m).tolist(),
         "next_trim_mm": (1e3 * one.next_m).tolist(),
         "offset_um": (per_um * one.moment_kg_m).tolist(),
         "offset_sigma_um": (per_um * one.estimate.sigma[MOMENT]).tolist(),

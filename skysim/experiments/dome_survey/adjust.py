@@ -359,9 +359,8 @@ def led_visibility(
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
     """
     visible = identified([match for _, match in pairs], len(prior.leds.id))
-    arm_m = prior.lever.camera_body_m
     camera_m = np.array(
-        [frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]
+        [frame.body_from_lab.inv().apply(prior.lever.camera_body_m) for frame, _ in pairs]
     ).reshape(-1, 3)
     angle_rad = survey_subset.ray_angles(
         prior.leds.position_m, camera_m, *np.nonzero(visible)

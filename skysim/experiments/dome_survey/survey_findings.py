@@ -202,10 +202,9 @@ class Coverage(NamedTuple):
 
 def coverage(run: SurveyRun) -> Coverage:
     """The coverage of a survey."""
-    survey = run.survey
     known = run.found._replace(uncertainty=run.prior.uncertainty)
     model = survey_model(known, run.noise_px)
-    return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
+    return Coverage(model, run.survey.body_from_lab, run.seen, run.accuracy)
 
 
 def coverage_before(

@@ -203,9 +203,8 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
         else None
     )
     floor_px = scene.tracker.centroid_sigma_px or factory.DOME_SIGMA_PX
-    disk_m = light.led.disk_diameter_m
     return CalibrationPrior(
-        camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
+        camera, leds, lever, floor_px, light.led.disk_diameter_m, levels / levels.max(), code
     )
 
 

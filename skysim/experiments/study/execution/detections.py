@@ -168,9 +168,8 @@ def solve_coded(
         lit = light_e > 0
         detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], lab.scene, rng)
         window = exposure_window(lab.scene, frame)
-        middle_s = window.middle_s
         attitude = tracker.solve_centroids(
-            detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame
+            detections, exposure_s=window.exposure_s, t_s=window.middle_s, frame=frame
         )
         if attitude.solved:
             break
