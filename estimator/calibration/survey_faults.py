@@ -21,7 +21,7 @@ from estimator.catalog.catalog import close_groups
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints, frozen
 from estimator.core.constants import SIGMA_PER_MAD
-from estimator.core.vectors import normalized
+from estimator.core.vectors import lengths, normalized
 
 FALSE_ALARMS = 1e-3  # share of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # least number of frames that show a light, or fail to show it
@@ -227,7 +227,7 @@ def _meeting_point(
     1. Select the rays within three times the median angle of the last round from x, or within GATE if that is larger.
     2. Solve for x.
     """
-    distance_m = np.linalg.norm(points - origins, axis=1)
+    distance_m = lengths(points - origins)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     at = np.median(points, axis=0)
     weak = (sigma_rad * distance_m.mean() / SURFACE_SIGMA_M) ** 2
@@ -249,7 +249,7 @@ def _meeting_point(
 def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
     """Return the (N,) sines of the angles between rays and the directions from their origins to a place."""
     toward = normalized(place_m - origins)
-    return np.linalg.norm(np.cross(toward, directions), axis=1)
+    return lengths(np.cross(toward, directions))
 
 
 def name_strays(
@@ -270,7 +270,7 @@ def name_strays(
     """
     if not strays or not len(candidates):
         return []
-    distance_m = np.linalg.norm(list_m[candidates][:, None] - np.array(strays), axis=2)
+    distance_m = lengths(list_m[candidates][:, None] - np.array(strays))
     rows, columns = linear_sum_assignment(np.minimum(distance_m, limit_m) ** 2)
     inside = distance_m[rows, columns] < limit_m
     leds = candidates[rows[inside]].tolist()

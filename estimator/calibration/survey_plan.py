@@ -24,7 +24,7 @@ from estimator.calibration.dome_survey import check_redundancy
 from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints, frozen
-from estimator.core.vectors import rms
+from estimator.core.vectors import lengths, rms
 
 MIN_SHARED = 8  # least number of LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # least number of LEDs that determine an attitude
@@ -271,7 +271,7 @@ class _Reach:
     def __init__(self, model: SurveyModel, candidates: Rotation, shown: Bools) -> None:
         place_m = model.leds.position_m
         self.arm_m = np.array(model.lever.camera_body_m)
-        self.distance_m = np.linalg.norm(place_m, axis=1)
+        self.distance_m = lengths(place_m)
         self.toward = place_m / self.distance_m[:, None]  # u
         # Sums over the positions from which each LED has been seen: 1, (u.c)^2 and c
         self.count, self.along_m2 = np.zeros((2, len(place_m)))

@@ -11,6 +11,11 @@ from estimator.core.jit import jit
 Vector = tuple[float, float, float]
 
 
+def lengths(vectors: Floats) -> Floats:
+    """Return (...) lengths of (..., K) vectors."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
 def normalized(vectors: Floats) -> Floats:
     """Return (..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

@@ -38,7 +38,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.core.vectors import normalized, rms
+from estimator.core.vectors import lengths, normalized, rms
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.direct_match import mutual_nearest
@@ -495,7 +495,7 @@ class DomeTracker(FrameTracker):
         """
         # a. Outliers
         residual = self._residual_px(centroids, observed, star, body_from_lab)
-        length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
+        length = lengths(residual) / (sigma_rad * self.camera.focal_px)
         inlier = length <= 5 * max(float(np.median(length)), 1.0)
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
@@ -511,7 +511,7 @@ class DomeTracker(FrameTracker):
             left = systematic.residual_products(fit, sigma_rad[inlier], common_rad)
             # The focal length's error is in the sigmas too, as if it were independent.
             focal_sigma = 0.0 if self.focal_fitted else self.camera.focal_sigma
-            focal_rad = focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
+            focal_rad = focal_sigma * lengths(view.tangent) / np.sqrt(2)
             noise = 1 - float(np.mean(focal_rad**2 / sigma_rad[inlier] ** 2))
             mean = noise * dof + float(np.trace(left))
             spread = np.sqrt(
@@ -535,7 +535,7 @@ class DomeTracker(FrameTracker):
         if self.leds.common_camera is not None:
             return np.zeros((3, 3))
         mean_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
-        direction = mean_m / np.linalg.norm(mean_m)
+        direction = normalized(mean_m)
         sigma_rad = self.lever.sigma_m / np.linalg.norm(mean_m)
         return sigma_rad**2 * (np.eye(3) - np.outer(direction, direction))
 
