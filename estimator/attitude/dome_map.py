@@ -18,6 +18,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.constants import INCH_M
 from estimator.core.errors import ImageError, file_bytes, reason
+from estimator.core.vectors import lengths
 
 UNIT_M = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": INCH_M}
 SAME_PLACE_M = 1e-4  # distance of two LEDs of a list that are one
@@ -71,7 +72,7 @@ class LedMap:
     @property
     def radius_m(self) -> Floats:
         """(N,) distance of each LED from the bearing center."""
-        return np.linalg.norm(self.position_m, axis=1)
+        return lengths(self.position_m)
 
     @classmethod
     def from_csv(
@@ -114,7 +115,7 @@ class LedMap:
             raise ImageError(
                 f"{path}: line {other}: the LED of line {one}; allowed: each once"
             )
-        radius_m = np.full(3, np.linalg.norm(position_m, axis=1).mean())
+        radius_m = np.full(3, lengths(position_m).mean())
         numbers = number.astype(np.int64)
         return cls(numbers, position_m, np.zeros(3), radius_m, sigma_m=sigma_m)
 

@@ -38,7 +38,7 @@ from estimator.attitude.rotation_fit import (
 )
 from estimator.attitude.solvers import quest
 from estimator.core.checks import Floats
-from estimator.core.vectors import normalized
+from estimator.core.vectors import lengths, normalized
 
 # Largest number of iterations of the methods that place points, and the rotation below which they stop.
 MAX_UPDATES = 20
@@ -89,7 +89,7 @@ def _from_points(
     for _ in range(MAX_UPDATES):
         # a. Points. They change little with the attitude, so a few updates converge.
         point_m, distance_m, by_ray_m, by_rotation_m = place(body_from_lab)
-        radius = np.linalg.norm(point_m, axis=1)
+        radius = lengths(point_m)
         d = point_m / radius[:, None]
         # b. Attitude
         previous = body_from_lab
@@ -223,7 +223,7 @@ def tappe(
 
     def place(last: Rotation) -> Points:
         # 1. Distances
-        distance_m = np.linalg.norm(last.apply(position_m) - lever.camera_body_m, axis=1)
+        distance_m = lengths(last.apply(position_m) - lever.camera_body_m)
         # 2. Points from the bearing
         point = lever.camera_body_m + distance_m[:, None] * rays
         # p = c + alpha u, alpha = |b - c|: dp/du = alpha I, and a rotation w changes alpha by u.(w x p) = w.(p x u).
@@ -263,7 +263,7 @@ def ray_on_surface(
             raise ValueError("a ray misses the believed surface")
         # 2. Points in body axes
         point = last.apply(intersection_m)
-        distance_m = np.linalg.norm(point - lever.camera_body_m, axis=1)
+        distance_m = lengths(point - lever.camera_body_m)
         # The gradient of |(x - center) / semi_axes|^2 / 2 is along the surface's normal; n is it over its part along u.
         normal = last.apply((intersection_m - leds.center_m) / leds.semi_axes_m**2)
         scaled_normal = normal / np.sum(normal * rays, axis=1, keepdims=True)

@@ -18,6 +18,7 @@ import numpy as np
 from estimator.attitude.rotation_fit import tangent_gradients
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
+from estimator.core.vectors import lengths
 
 
 class Geometry(NamedTuple):
@@ -166,13 +167,13 @@ def with_survey(
 
 def focal_error_px(camera: Camera, xy_px: Floats) -> Floats:
     """Return the (N,) position errors from the focal length: its relative sigma times the distance from the center."""
-    distance_px = np.linalg.norm(xy_px - camera.center_px, axis=1)
+    distance_px = lengths(xy_px - camera.center_px)
     return camera.focal_sigma * distance_px
 
 
 def focal_error_rad(rays_cam: Floats, camera: Camera) -> Floats:
     """Return the (N,) standard deviation of rays' tangents from the error of the focal length, rms of both axes."""
-    tangent = np.linalg.norm(rays_cam[:, :2] / rays_cam[:, 2:], axis=1)
+    tangent = lengths(rays_cam[:, :2] / rays_cam[:, 2:])
     return camera.focal_sigma * tangent / np.sqrt(2)
 
 

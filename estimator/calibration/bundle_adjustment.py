@@ -90,11 +90,6 @@ class Sightings:
         )
 
 
-def free_lens(fit_distortion: bool) -> int:
-    """Return the number of lens elements that a survey fits: focal length and center; with k1, k2, p1, p2 if asked."""
-    return 7 if fit_distortion else 3
-
-
 class Assumed(NamedTuple):
     """Lever and focal length as they are known without the frames; they enter the adjustment as measurements.
 
@@ -166,14 +161,14 @@ class Bundle:
     def start(
         cls, leds: LedMap, lever: Lever, camera: Camera, attitudes: Rotation, distortion: bool
     ) -> Bundle:
-        """Start values of all parameters, without priors; with or without a free distortion."""
+        """Start values without priors; free of the lens are focal length and center, and with `distortion` k1 to p2."""
         return cls(
             leds.position_m,
             attitudes.as_matrix().reshape(-1, 3, 3),
             np.array(lever.camera_body_m),
             lever.cam_from_body.as_matrix(),
             camera.lens,
-            free_lens(distortion),
+            7 if distortion else 3,
             leds.position_m,
         )
 

@@ -48,6 +48,7 @@ from estimator.calibration.survey_subset import (
 from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
+from estimator.core.vectors import lengths, rms
 
 # Cauchy's width for 95 % efficiency under Gaussian noise (Holland & Welsch 1977), in sigmas.
 CAUCHY = 2.385
@@ -252,7 +253,7 @@ def _fit(
         scale *= misfit
     # The lever to 10 % of the least LED distance, and the focal length to 10 %
     sigma = np.sqrt(np.maximum(np.diag(covariances.shared), 0))
-    nearest_m = np.linalg.norm(fitted.position_m, axis=1).min()
+    nearest_m = lengths(fitted.position_m).min()
     determined = sigma[:3].max() < 0.1 * nearest_m and sigma[3] < 0.1 * fitted.lens[0]
     if not (determined and np.isfinite(sigma).all()):
         raise LinAlgError
@@ -356,7 +357,7 @@ def _reject_misidentified(full: Bundle, sightings: Sightings) -> tuple[Bundle, n
 
 def _inliers(bundle: Bundle, sightings: Sightings, gate: float) -> np.ndarray:
     """Return (M,) whether each residual is below `gate` robust sigmas."""
-    length = np.linalg.norm(ba.residuals(bundle, sightings), axis=1)
+    length = lengths(ba.residuals(bundle, sightings))
     return length < gate * ba.robust_scale(bundle, sightings)
 
 
@@ -396,7 +397,7 @@ def _report(
         attitude_covariance_rad2=by_rotation,
         lever_covariance_m2=shared[:3, :3],
         lens_covariance=shared[3:, 3:],
-        rms_px=float(np.sqrt(np.mean(residual_px**2))),
+        rms_px=rms(residual_px),
         common_m=common_m,
         common_camera=common_camera,
         **quality,

@@ -22,7 +22,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
-from estimator.core.vectors import normalized
+from estimator.core.vectors import lengths, normalized
 
 
 @frozen
@@ -115,7 +115,7 @@ def separation_rad(first: Floats, second: Floats) -> Floats:
     The angle is computed from half the chord, 2 asin(|u - v| / 2), which is accurate for small angles, unlike the arc
     cosine of eq. 45.
     """
-    return 2 * np.arcsin(np.linalg.norm(first - second, axis=-1) / 2)
+    return 2 * np.arcsin(lengths(first - second) / 2)
 
 
 def pooled(value: Floats, group: Ints) -> Floats:

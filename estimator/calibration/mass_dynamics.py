@@ -154,7 +154,7 @@ class LabConstants:
 
 @frozen
 class Prior:
-    """Prior values of the parameters, (P,), and their standard deviations.
+    """Prior values of the parameters, (P,), and their standard deviations; and the known constants.
 
     The parameters are, in this order: inertia xx, yy, zz, xy, xz, yz about the bearing (kg m2); moment m r, mass times
     center of mass (3,) (kg m); torque constant in the lab (3,) (N m); viscous and quadratic drag (N m s, N m s2);
@@ -164,6 +164,7 @@ class Prior:
 
     values: Floats
     sigma: Floats
+    lab: LabConstants
 
     def __post_init__(self) -> None:
         if not (np.all(np.isfinite(self.values)) and np.all(self.sigma > 0)):
@@ -300,28 +301,27 @@ class EquationsOfMotion:
 
     Parameters
     ----------
-    record, lab
-        Measured motion and known constants
+    record
+        Measured motion
+    prior
+        The inertia J0 and the known constants
     parameters
         (P, B) parameters of the motions, in the order of `Prior`
-    assumed
-        (P,) parameters with the inertia J0
     """
 
-    def __init__(
-        self, record: BearingRecord, lab: LabConstants, parameters: Floats, assumed: Floats
-    ) -> None:
+    def __init__(self, record: BearingRecord, prior: Prior, parameters: Floats) -> None:
         # J, J^-1 and J J0^-1, (3, 3, B), with the trim masses of the record
         inertia = inertia_matrix(parameters[INERTIA]) + record.added_inertia_kg_m2[:, :, None]
         inverse = np.asarray(np.linalg.inv(inertia.transpose(2, 0, 1)), dtype=np.float64)
         self.inverse: Floats = inverse.transpose(1, 2, 0)
         self.torque_scale = np.einsum(
-            "ijb,jk->ikb", inertia, inverse_inertia(record, assumed)
+            "ijb,jk->ikb", inertia, inverse_inertia(record, prior.values)
         )
         self.moment = parameters[MOMENT] + record.added_moment_kg_m[:, None]
         self.lab_torque = parameters[LAB_TORQUE]
         self.drag = parameters[DRAG]
         self.wheel_scale = 1 + parameters[WHEELS:]
+        lab = prior.lab
         self.axes = lab.wheel_axes
         self.earth = lab.earth_lab_rad_s[:, None]
         self.gravity = np.array([[0.0], [0.0], [-lab.gravity_m_s2]])
@@ -329,9 +329,9 @@ class EquationsOfMotion:
 
     def stored(self, t_s: Floats) -> Floats:
         """Return A (1 + e) h, (3, B): the momentum of the wheels at times (B,), in body axes."""
-        wheel_t_s = self.record.wheel_t_s
         measured = [
-            np.interp(t_s, wheel_t_s, one) for one in self.record.wheel_momentum_nms.T
+            np.interp(t_s, self.record.wheel_t_s, one)
+            for one in self.record.wheel_momentum_nms.T
         ]
         return self.axes @ (self.wheel_scale * np.array(measured))
 
@@ -418,7 +418,6 @@ def difference_steps(
 
 def transition(
     record: BearingRecord,
-    lab: LabConstants,
     first: int,
     before: States,
     values: Floats,
@@ -444,7 +443,7 @@ def transition(
         np.max(np.abs(before.momentum), initial=1e-3 * float(np.max(values[INERTIA])))
     )
     state_step, step = difference_steps(
-        values, prior.sigma, largest, float(np.max(lab.torque_rms_nm))
+        values, prior.sigma, largest, float(np.max(prior.lab.torque_rms_nm))
     )
     # 1. Columns of each interval: unchanged, each element of the state changed, each parameter changed
     columns = 1 + STATE + size
@@ -453,17 +452,19 @@ def transition(
     parameters = np.repeat(values[:, None], columns, axis=1)
     parameters[:, 1 + STATE :] += np.diag(step)
     pick: Ints = np.repeat(np.arange(count), columns)
-    motion = EquationsOfMotion(record, lab, np.tile(parameters, count), prior.values)
+    motion = EquationsOfMotion(record, prior, np.tile(parameters, count))
     t_s = record.t_s[first : first + count + 1]
     start = before.take(pick).moved(np.tile(change, count))
     # 2. Integration
-    end = motion.integrate(t_s[:-1][pick], t_s[1:][pick], start, lab.torque_correlation_s)
+    end = motion.integrate(
+        t_s[:-1][pick], t_s[1:][pick], start, prior.lab.torque_correlation_s
+    )
     # 3. Difference quotients
     after = end.take(slice(None, None, columns))
     slopes = end.minus(after.take(pick)).reshape(STATE, count, columns).transpose(1, 0, 2)
     slopes = slopes[:, :, 1:] / np.concatenate([state_step, step])
     # 4. Noise
-    noise = torque_noise(np.diff(t_s), record, before, values, prior.values, lab)
+    noise = torque_noise(np.diff(t_s), record, before, values, prior)
     return Transition(after, slopes[:, :, :STATE], slopes[:, :, STATE:], noise)
 
 
@@ -472,8 +473,7 @@ def torque_noise(
     record: BearingRecord,
     before: States,
     values: Floats,
-    assumed: Floats,
-    lab: LabConstants,
+    prior: Prior,
 ) -> Floats:
     """Return the (K, 9, 9) covariance of the states after K intervals from the random torque and the wheels' noise.
 
@@ -488,9 +488,10 @@ def torque_noise(
     ----------
     duration_s
         (K,) lengths of the intervals
-    values, assumed
-        (P,) parameters with the inertia J, and with J0
+    values, prior
+        (P,) parameters with the inertia J, and the prior with J0
     """
+    lab = prior.lab
     tau = lab.torque_correlation_s
     s = duration_s[:, None] * (1 + GAUSS_X) / 2
     c = np.exp(-s / tau)
@@ -503,9 +504,9 @@ def torque_noise(
     density = np.diag(2 * lab.torque_rms_nm**2 / tau)
     spread = np.zeros((len(duration_s), 3, 3, 3))
     R_body_from_lab = before.rotation.inv().as_matrix()
-    inverse = inverse_inertia(record, assumed)
+    inverse = inverse_inertia(record, prior.values)
     spread[:, 0] = inverse @ R_body_from_lab
-    spread[:, 1] = momentum_scale(record, before, assumed, values)
+    spread[:, 1] = momentum_scale(record, before, prior.values, values)
     spread[:, 2] = np.eye(3)
     blocks = np.einsum("kij,kiab,bc,kjdc->kiajd", moments, spread, density, spread)
     noise = blocks.reshape(-1, STATE, STATE)

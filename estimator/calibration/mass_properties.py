@@ -36,7 +36,6 @@ from estimator.calibration.mass_dynamics import (
     STATE,
     BearingRecord,
     EquationsOfMotion,
-    LabConstants,
     MassEstimate,
     Prior,
     States,
@@ -85,9 +84,7 @@ class Reduced(NamedTuple):
     chi2: float
 
 
-def estimate_mass(
-    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
-) -> MassEstimate:
+def estimate_mass(records: Sequence[BearingRecord], prior: Prior) -> MassEstimate:
     """Return the mass properties from one or several records: the numbered steps of the module.
 
     Raises
@@ -96,15 +93,13 @@ def estimate_mass(
         If the fit does not converge.
     """
     values = prior.values.copy()
-    motions = [first_states(record, lab, values) for record in records]
+    motions = [first_states(record, prior, values) for record in records]
     information = np.diag(prior.sigma**-2)
     attitudes = sum(len(record.t_s) for record in records)
     small = False
     for _ in range(MAX_ITERATIONS):
         # 1. Linearization and elimination
-        parts = [
-            reduced(*one, lab, values, prior) for one in zip(records, motions, strict=True)
-        ]
+        parts = [reduced(*one, values, prior) for one in zip(records, motions, strict=True)]
         # 2. Information
         normal = information + sum(part.normal for part in parts)
         gradient = information @ (prior.values - values) + sum(
@@ -135,9 +130,7 @@ def estimate_mass(
     )
 
 
-def estimate_with_noise(
-    records: Sequence[BearingRecord], lab: LabConstants, prior: Prior
-) -> MassEstimate:
+def estimate_with_noise(records: Sequence[BearingRecord], prior: Prior) -> MassEstimate:
     """Return the mass properties, with the attitudes' noise scaled by a factor at which the misfit is 1.
 
     A tracker's own covariance is too small where it does not model an error, and too large where it is cautious. The
@@ -145,7 +138,7 @@ def estimate_with_noise(
     """
     factor = 1.0
     for _ in range(MAX_FACTORS):
-        estimate = estimate_mass([one.with_noise(factor) for one in records], lab, prior)
+        estimate = estimate_mass([one.with_noise(factor) for one in records], prior)
         if abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE:
             break
         factor = float(np.clip(factor * estimate.misfit**FACTOR_POWER, *FACTOR_LIMITS))
@@ -202,9 +195,9 @@ def considered(
     return added + total @ total.T
 
 
-def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> States:
+def first_states(record: BearingRecord, prior: Prior, values: Floats) -> States:
     """Return the start states: the measured attitudes, the momentum from their differences, no random torque."""
-    motion = EquationsOfMotion(record, lab, values[:, None], values)
+    motion = EquationsOfMotion(record, prior, values[:, None])
     # Mean rate between two attitudes, interpolated to their times
     turned = (record.lab_from_body[:-1].inv() * record.lab_from_body[1:]).as_rotvec()
     mean_rate = turned / np.diff(record.t_s)[:, None]
@@ -217,9 +210,7 @@ def first_states(record: BearingRecord, lab: LabConstants, values: Floats) -> St
     return States(quaternion, turn(quaternion, own), np.zeros_like(rate))
 
 
-def reduced(
-    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
-) -> Reduced:
+def reduced(record: BearingRecord, states: States, values: Floats, prior: Prior) -> Reduced:
     """Linearize a record's residuals and eliminate its states.
 
     1. Compute the residuals of the transitions and their slopes, in standard deviations (`whitened_links`).
@@ -231,7 +222,7 @@ def reduced(
     count = len(record.t_s)
     size = len(values)
     # 1. Residuals and slopes
-    rows = whitened_links(record, states, lab, values, prior)
+    rows = whitened_links(record, states, values, prior)
     # 2. Normal equations; columns are the state before, the state after, the parameters and the residual.
     products = rows.mT @ rows
     before = slice(0, STATE)
@@ -246,7 +237,7 @@ def reduced(
     corner = products[:, rest, rest].sum(axis=0)
     # 3. Attitudes
     chi2 = float(np.sum(rows[:, :, -1] ** 2))
-    chi2 += add_measured(record, states, lab, values, (diagonal, border, corner))
+    chi2 += add_measured(record, states, values, prior, (diagonal, border, corner))
     # 4. Elimination
     flat = border.reshape(-1, size + 1)
     try:
@@ -260,7 +251,7 @@ def reduced(
 
 
 def whitened_links(
-    record: BearingRecord, states: States, lab: LabConstants, values: Floats, prior: Prior
+    record: BearingRecord, states: States, values: Floats, prior: Prior
 ) -> Floats:
     """Return the slopes of the transitions' residuals, and the residuals, in standard deviations.
 
@@ -271,7 +262,7 @@ def whitened_links(
     """
     # Residuals: integrated minus fitted state
     before = states.take(slice(None, -1))
-    link = transition(record, lab, 0, before, values, prior)
+    link = transition(record, 0, before, values, prior)
     misfit = link.after.minus(states.take(slice(1, None))).T[:, :, None]
     by_after = np.broadcast_to(-np.eye(STATE), link.by_state.shape)
     rows = np.concatenate([link.by_state, by_after, link.by_parameter, misfit], axis=2)
@@ -292,8 +283,8 @@ def whitened_links(
 def add_measured(
     record: BearingRecord,
     states: States,
-    lab: LabConstants,
     values: Floats,
+    prior: Prior,
     to: tuple[Floats, Floats, Floats],
 ) -> float:
     """Add the N attitudes, and the prior of the first random torque, to the normal equations; return their chi-square.
@@ -309,7 +300,7 @@ def add_measured(
     diagonal, border, corner = to
     # The residual depends on the attitude and on the bias with the same derivative, -I.
     weight = np.linalg.inv(record.varying_rad2)
-    torque_weight = lab.torque_rms_nm**-2.0
+    torque_weight = prior.lab.torque_rms_nm**-2.0
     off = measured_minus(record.lab_from_body, states.rotation, values[BIAS])
     pull = np.einsum("nij,nj->ni", weight, off)
     diagonal[:, :3, :3] += weight
@@ -353,9 +344,7 @@ AT_BIAS = slice(
 RATE_SIGMA_RAD_S = 0.01  # standard deviation of the rate from the attitudes before and after
 
 
-def filter_mass(
-    record: BearingRecord, lab: LabConstants, prior: Prior
-) -> Iterator[MassEstimate]:
+def filter_mass(record: BearingRecord, prior: Prior) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude from number START + 2 on; its misfit is that of the innovations so far.
 
     State and parameters are those of `estimate_mass`; the parameters are constant.
@@ -380,10 +369,10 @@ def filter_mass(
             f"mass properties: {len(record.t_s)} attitudes; allowed for a filter: {least} or more"
         )
     # 1. Batch
-    begun = estimate_mass([cut(record, slice(0, START))], lab, prior)
+    begun = estimate_mass([cut(record, slice(0, START))], prior)
     # 2. to 4. Filter
     rest = cut(record, slice(START, None))
-    yield from filter_from(begun, rest, lab, prior)
+    yield from filter_from(begun, rest, prior)
 
 
 def cut(record: BearingRecord, which: slice) -> BearingRecord:
@@ -404,7 +393,7 @@ def cut(record: BearingRecord, which: slice) -> BearingRecord:
 
 
 def filter_from(
-    begun: MassEstimate, record: BearingRecord, lab: LabConstants, prior: Prior
+    begun: MassEstimate, record: BearingRecord, prior: Prior
 ) -> Iterator[MassEstimate]:
     """Yield the estimate after each attitude but the first two, from earlier parameters and their covariance.
 
@@ -413,12 +402,12 @@ def filter_from(
     size = len(begun.values)
     values = begun.values
     # 2. State at the second attitude
-    states = first_states(record, lab, values).take(slice(1, 2))
-    covariance = first_covariance(begun, record, lab)
+    states = first_states(record, prior, values).take(slice(1, 2))
+    covariance = first_covariance(begun, record, prior)
     chi2 = 0.0
     for n in range(2, len(record.t_s)):
         # 3. Integration: P <- F P F^T + Q
-        link = transition(record, lab, n - 1, states, values, prior)
+        link = transition(record, n - 1, states, values, prior)
         F = np.eye(STATE + size)
         F[:STATE] = np.hstack([link.by_state[0], link.by_parameter[0]])
         covariance = F @ covariance @ F.T
@@ -436,7 +425,7 @@ def filter_from(
         yield MassEstimate(values, covariance[STATE:, STATE:], chi2 / (3 * (n - 1)))
 
 
-def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstants) -> Floats:
+def first_covariance(begun: MassEstimate, record: BearingRecord, prior: Prior) -> Floats:
     """Return the (9 + P, 9 + P) covariance of state and parameters at the second attitude.
 
     The momentum H = R (J w + A (1 + e) h) has the errors of the rate and of the parameters, so it is correlated with
@@ -448,7 +437,7 @@ def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstan
     one = cut(record, slice(0, MIN_ATTITUDES))
     step = begun.sigma
     changed = (values, *(values + np.diag(step)))
-    momenta = [first_states(one, lab, each).momentum[:, 1] for each in changed]
+    momenta = [first_states(one, prior, each).momentum[:, 1] for each in changed]
     slope = np.zeros((STATE, len(values)))
     difference = np.array(momenta[1:]) - momenta[0]
     slope[3:6] = difference.T / step
@@ -457,7 +446,7 @@ def first_covariance(begun: MassEstimate, record: BearingRecord, lab: LabConstan
     own[:3, :3] = record.covariance_rad2[1]
     R_inertia = record.lab_from_body[1].as_matrix() @ begun.inertia_kg_m2
     own[3:6, 3:6] = RATE_SIGMA_RAD_S**2 * R_inertia @ R_inertia.T
-    own[6:, 6:] = np.diag(lab.torque_rms_nm**2)
+    own[6:, 6:] = np.diag(prior.lab.torque_rms_nm**2)
     return np.block([[own + slope @ P @ slope.T, slope @ P], [P @ slope.T, P]])
 
 

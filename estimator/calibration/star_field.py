@@ -42,6 +42,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats, Ints, frozen
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
+from estimator.core.vectors import lengths, rms
 
 LENS = 8  # focal_px, center x and y, k1, k2, p1, p2, k3
 # In a frame: two determine its attitude and leave only one coordinate for the lens
@@ -186,7 +187,7 @@ def calibrate(
             fit, _ = ba.adjust(fit, used, current)
             previous = current
         # 4. Wrong identifications
-        distance = np.linalg.norm(ba.residuals(fit, sightings), axis=1)
+        distance = lengths(ba.residuals(fit, sightings))
         keep = enough & (distance < GATE * ba.robust_scale(fit, used))
         outliers = sightings.in_frames[~keep & enough]
         tied = np.bincount(sightings.frame[keep], minlength=len(frames)) >= LEAST_STARS
@@ -383,7 +384,7 @@ def _robust_attitude(rays: Floats, vectors: Floats) -> Floats:
     weight = np.ones(len(rays))
     for _ in range(START_ROUNDS):
         R_cam_from_ref, _ = kernel.wahba(rays, vectors, weight)
-        separation = np.linalg.norm(rays - vectors @ R_cam_from_ref.T, axis=1)
+        separation = lengths(rays - vectors @ R_cam_from_ref.T)
         # Without the floor, one pair of residual 0 would have infinite weight.
         weight = 1 / np.maximum(separation, 0.1 * np.median(separation) + 1e-9)
     return R_cam_from_ref
@@ -434,7 +435,7 @@ def _report(
         tied,
         outliers,
         len(sightings.frame),
-        rms_px=float(np.sqrt(np.mean(residual_px**2))),
+        rms_px=rms(residual_px),
         misfit=float(np.sqrt(np.sum(residual**2) / max(freedom, 1))),
         magnitude=zero,
     )

@@ -21,7 +21,7 @@ from estimator.catalog.catalog import close_groups
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints, frozen
 from estimator.core.constants import SIGMA_PER_MAD
-from estimator.core.vectors import normalized
+from estimator.core.vectors import lengths, normalized
 
 FALSE_ALARMS = 1e-3  # share of surveys with a false alarm of one kind
 MIN_FRAMES = 3  # least number of frames that show a light, or fail to show it
@@ -57,13 +57,12 @@ class HeldFrames:
         apart_px
             Least distance from other LEDs, whose images may merge with it
         """
-        out = np.zeros((len(self.body_from_lab), len(self.leds.id)), dtype=bool)
+        rows = []
         size_px = np.array([self.camera.width_px, self.camera.height_px])
         margin = np.broadcast_to(margin_px, len(self.leds.id))[:, None]
-        for row, attitude in zip(out, self.body_from_lab, strict=True):
-            # An LED behind the camera is put far outside.
+        for attitude in self.body_from_lab:
+            # NaN for an LED behind the camera, which is outside everything.
             xy_px = project(attitude, self.leds.position_m, self.lever, self.camera)
-            xy_px = np.nan_to_num(xy_px, nan=-1e9)
             inside = ((xy_px >= margin) & (xy_px <= size_px - 1 - margin)).all(axis=1)
             # Distance to the nearest other LED, one outside the frame included
             around = (xy_px > -apart_px) & (xy_px < size_px + apart_px)
@@ -71,8 +70,8 @@ class HeldFrames:
             if len(near) > 1:
                 distance_px, _ = cKDTree(xy_px[near]).query(xy_px[near], 2)
                 inside[near[distance_px[:, 1] < apart_px]] = False
-            row[:] = inside
-        return out
+            rows.append(inside)
+        return np.array(rows)
 
     def rays(self, frame: Ints, xy_px: Floats) -> tuple[Floats, Floats]:
         """Return the (M, 3) origins and unit directions, in the lab, of the rays to pixels (M, 2) of frames (M,)."""
@@ -228,7 +227,7 @@ def _meeting_point(
     1. Select the rays within three times the median angle of the last round from x, or within GATE if that is larger.
     2. Solve for x.
     """
-    distance_m = np.linalg.norm(points - origins, axis=1)
+    distance_m = lengths(points - origins)
     across = np.eye(3) - directions[:, :, None] * directions[:, None, :]
     at = np.median(points, axis=0)
     weak = (sigma_rad * distance_m.mean() / SURFACE_SIGMA_M) ** 2
@@ -250,7 +249,7 @@ def _meeting_point(
 def _off_rad(place_m: Floats, origins: Floats, directions: Floats) -> Floats:
     """Return the (N,) sines of the angles between rays and the directions from their origins to a place."""
     toward = normalized(place_m - origins)
-    return np.linalg.norm(np.cross(toward, directions), axis=1)
+    return lengths(np.cross(toward, directions))
 
 
 def name_strays(
@@ -271,7 +270,7 @@ def name_strays(
     """
     if not strays or not len(candidates):
         return []
-    distance_m = np.linalg.norm(list_m[candidates][:, None] - np.array(strays), axis=2)
+    distance_m = lengths(list_m[candidates][:, None] - np.array(strays))
     rows, columns = linear_sum_assignment(np.minimum(distance_m, limit_m) ** 2)
     inside = distance_m[rows, columns] < limit_m
     leds = candidates[rows[inside]].tolist()

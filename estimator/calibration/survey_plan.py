@@ -24,6 +24,7 @@ from estimator.calibration.dome_survey import check_redundancy
 from estimator.calibration.survey_subset import CONNECTING_RAD, connected_subset
 from estimator.core.camera import Camera
 from estimator.core.checks import Bools, Floats, Ints, frozen
+from estimator.core.vectors import lengths, rms
 
 MIN_SHARED = 8  # least number of LEDs that an attitude shares with those before it
 LEAST_CROSSING = 2  # least number of LEDs that determine an attitude
@@ -74,6 +75,12 @@ class SurveyModel:
                     f"survey: {name} is {getattr(self, name)}; allowed: 0 or more"
                 )
 
+    @property
+    def assumed(self) -> Assumed:
+        """Lever and focal length, which enter an adjustment as measurements."""
+        arm_m = np.array(self.lever.camera_body_m)
+        return Assumed(arm_m, self.lever_sigma_m, self.camera.focal_px, self.focal_sigma_px)
+
     def visible(self, body_from_lab: Rotation, margin_px: float = 0.0) -> Bools:
         """Return (F, N) whether each LED is on the chip at each of F attitudes, at least `margin_px` from its edge."""
         rows = []
@@ -108,7 +115,7 @@ class SurveyAccuracy:
     @property
     def led_rms_m(self) -> float:
         """Root mean square of the errors of the measured LEDs along an axis."""
-        return float(np.sqrt(np.mean(self.led_sigma_m[self.measured] ** 2)))
+        return rms(self.led_sigma_m[self.measured])
 
 
 def predict(model: SurveyModel, body_from_lab: Rotation, seen: Bools) -> SurveyAccuracy:
@@ -158,12 +165,9 @@ def _bundle(
     model: SurveyModel, body_from_lab: Rotation, seen: Bools
 ) -> tuple[Bundle, Sightings]:
     """Return the assumed model as a bundle, with sightings exactly where it predicts them."""
-    camera = model.camera
-    known = model.leds, model.lever, camera
+    known = model.leds, model.lever, model.camera
     start = Bundle.start(*known, body_from_lab, model.fit_distortion)
-    arm_m = start.camera_body_m
-    assumed = Assumed(arm_m, model.lever_sigma_m, camera.focal_px, model.focal_sigma_px)
-    bundle = replace(start, map_sigma_m=model.leds_sigma_m, assumed=assumed)
+    bundle = replace(start, map_sigma_m=model.leds_sigma_m, assumed=model.assumed)
     # With pixels of 0 the residuals are the negative predictions over sigma.
     frame, led = np.nonzero(seen)
     sightings = Sightings(
@@ -267,7 +271,7 @@ class _Reach:
     def __init__(self, model: SurveyModel, candidates: Rotation, shown: Bools) -> None:
         place_m = model.leds.position_m
         self.arm_m = np.array(model.lever.camera_body_m)
-        self.distance_m = np.linalg.norm(place_m, axis=1)
+        self.distance_m = lengths(place_m)
         self.toward = place_m / self.distance_m[:, None]  # u
         # Sums over the positions from which each LED has been seen: 1, (u.c)^2 and c
         self.count, self.along_m2 = np.zeros((2, len(place_m)))

@@ -19,7 +19,7 @@ from estimator.calibration.bundle_adjustment import (
     eliminate_lights,
 )
 from estimator.core.checks import Bools, Floats, Ints, frozen
-from estimator.core.vectors import normalized
+from estimator.core.vectors import lengths, normalized
 
 # Least rms angle of the rays to one light from their main direction; below it, the distance is undetermined.
 CROSSING_RAD = 0.005
@@ -259,7 +259,7 @@ def common_errors(terms: NormalEquations, bundle: Bundle) -> tuple[Floats, Float
     shared = slice(3 * len(bundle.R_body_from_lab), None)
     first = np.linalg.qr(root[shared].T)[0]
     # 3. Directions of the lights
-    radius_m = np.linalg.norm(bundle.position_m, axis=1)[:, None, None]
+    radius_m = lengths(bundle.position_m)[:, None, None]
     along = (bundle.position_m / radius_m[:, 0])[:, :, None]
     start = np.arange(len(along) + 1)
     across = bsr_array(((np.eye(3) - along * along.mT) / radius_m, start[:-1], start))

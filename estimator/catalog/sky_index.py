@@ -22,7 +22,7 @@ from scipy.spatial import cKDTree
 from estimator.core.checks import Floats, Ints, Ints32
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
-from estimator.core.vectors import row, squared_chord
+from estimator.core.vectors import lengths, row, squared_chord
 
 # Spatial grid for searches by direction: the cube [-1, 1]^3 about the unit sphere, divided into cells.
 
@@ -279,7 +279,7 @@ def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[Ints32, Floats]:
     chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
     pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    half_chord = np.linalg.norm(vectors[pair[:, 0]] - vectors[pair[:, 1]], axis=1) / 2
+    half_chord = lengths(vectors[pair[:, 0]] - vectors[pair[:, 1]]) / 2
     return pair, 2 * np.arcsin(np.minimum(half_chord, 1.0))
 
 

@@ -11,9 +11,19 @@ from estimator.core.jit import jit
 Vector = tuple[float, float, float]
 
 
+def lengths(vectors: Floats) -> Floats:
+    """Return (...) lengths of (..., K) vectors."""
+    return np.linalg.norm(vectors, axis=-1)
+
+
 def normalized(vectors: Floats) -> Floats:
     """Return (..., K) vectors, divided by their lengths."""
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+
+
+def rms(values: Floats) -> float:
+    """Return the root mean square of all values."""
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def rotation_of(xyzw: Floats) -> Rotation:

@@ -29,7 +29,6 @@ from estimator.trackers.dome_tracker import MIN_ERROR_PX, DomeTracker
 from estimator.trackers.pipeline import (
     Clock,
     Settings,
-    direction_sigma_rad,
 )
 
 COLLECTING = "codes: too few lights have been seen long enough"
@@ -248,10 +247,9 @@ class CodedTracker(DomeTracker):
     def _tangents(self, centroids: Centroids) -> tuple[Floats, Floats]:
         """Return the (K, 3) rays of centroids and the (K,) errors of their tangents, map and lever included."""
         rays = self.camera.rays(centroids.xy_px)
-        focal_px = self.camera.focal_px
         own = np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings),
-            MIN_ERROR_PX / focal_px,
+            self.direction_sigma_rad(centroids),
+            MIN_ERROR_PX / self.camera.focal_px,
         )
         tangent = np.linalg.norm(rays[:, :2] / rays[:, 2:], axis=1)
         lever = self.lever.sigma_m / self.sphere.radius_m.min() * tangent

@@ -38,7 +38,7 @@ from estimator.core import checks
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.core.vectors import normalized
+from estimator.core.vectors import lengths, normalized, rms
 from estimator.identification import led_search
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.direct_match import mutual_nearest
@@ -50,7 +50,6 @@ from estimator.trackers.pipeline import (
     FrameTracker,
     Settings,
     check_algorithms,
-    direction_sigma_rad,
     run_all_stages,
 )
 from estimator.trackers.rolling_shutter import Lights, solve_lights
@@ -253,8 +252,7 @@ class DomeTracker(FrameTracker):
         """
         Centroids.check_values(centroids)
         clock = clock or Clock()
-        lever_cam_m = self.lever.pupil_cam_m
-        lights = Lights(self.leds.position_m, lever_cam_m, self._with_errors)
+        lights = Lights(self.leds.position_m, self.lever.pupil_cam_m, self._with_errors)
         solve = partial(self._solve_global, clock=clock, exposure_s=exposure_s)
         return solve_lights(self.camera, lights, centroids, solve, rate, exposure_s)
 
@@ -269,7 +267,7 @@ class DomeTracker(FrameTracker):
     ) -> Attitude:
         """Identify and solve centroids of one time."""
         if self.settings.identifier in FITS_FOCAL:
-            sigma_rad = direction_sigma_rad(centroids, self.camera, self.settings)
+            sigma_rad = self.direction_sigma_rad(centroids)
         else:
             sigma_rad = self._pixel_rad(centroids)
         flux_s = centroids.flux / exposure_s if exposure_s else None
@@ -314,7 +312,7 @@ class DomeTracker(FrameTracker):
         observed = match.observed
         star = match.star
         rays = self.camera.rays(centroids.xy_px[observed])
-        pixel_rad = direction_sigma_rad(centroids, self.camera, self.settings)[observed]
+        pixel_rad = self.direction_sigma_rad(centroids)[observed]
         sigma_rad = np.hypot(pixel_rad, self.led_sigma_rad[star])
         body_from_lab = self.lever.body_from_cam * match.cam_from_ref
         ratio = fit_focal_ratio(
@@ -342,7 +340,7 @@ class DomeTracker(FrameTracker):
     def _pixel_rad(self, centroids: Centroids) -> Floats:
         """Return the (N,) standard deviations of the directions, from the centroids and the focal length."""
         return np.hypot(
-            direction_sigma_rad(centroids, self.camera, self.settings),
+            self.direction_sigma_rad(centroids),
             self._focal_rad(self.camera.rays(centroids.xy_px)),
         )
 
@@ -400,7 +398,7 @@ class DomeTracker(FrameTracker):
             cam_from_lab,
             covariance + lever_covariance,
             StarMatch(observed, star, cam_from_lab, match.log10_chance),
-            float(np.sqrt(np.mean(residual**2))),
+            rms(residual),
             self.camera,
             shared + lever_covariance,
             constant_rad2=lever_covariance,
@@ -497,7 +495,7 @@ class DomeTracker(FrameTracker):
         """
         # a. Outliers
         residual = self._residual_px(centroids, observed, star, body_from_lab)
-        length = np.linalg.norm(residual, axis=1) / (sigma_rad * self.camera.focal_px)
+        length = lengths(residual) / (sigma_rad * self.camera.focal_px)
         inlier = length <= 5 * max(float(np.median(length)), 1.0)
         if inlier.sum() < max(MIN_EVIDENCE_MATCHES, len(inlier) / 2):
             inlier[:] = True
@@ -513,7 +511,7 @@ class DomeTracker(FrameTracker):
             left = systematic.residual_products(fit, sigma_rad[inlier], common_rad)
             # The focal length's error is in the sigmas too, as if it were independent.
             focal_sigma = 0.0 if self.focal_fitted else self.camera.focal_sigma
-            focal_rad = focal_sigma * np.linalg.norm(view.tangent, axis=1) / np.sqrt(2)
+            focal_rad = focal_sigma * lengths(view.tangent) / np.sqrt(2)
             noise = 1 - float(np.mean(focal_rad**2 / sigma_rad[inlier] ** 2))
             mean = noise * dof + float(np.trace(left))
             spread = np.sqrt(
@@ -537,7 +535,7 @@ class DomeTracker(FrameTracker):
         if self.leds.common_camera is not None:
             return np.zeros((3, 3))
         mean_m = cam_from_lab.apply(self.leds.position_m[star].mean(axis=0))
-        direction = mean_m / np.linalg.norm(mean_m)
+        direction = normalized(mean_m)
         sigma_rad = self.lever.sigma_m / np.linalg.norm(mean_m)
         return sigma_rad**2 * (np.eye(3) - np.outer(direction, direction))
 

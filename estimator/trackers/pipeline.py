@@ -390,15 +390,15 @@ class FrameTracker:
         )
         return Report(attitude, centroids, clock.seconds)
 
+    def direction_sigma_rad(self, centroids: Centroids) -> Floats:
+        """Return the (N,) standard deviation of a direction, rad, from the centroid's own error and the floor."""
+        sigma_px = np.hypot(centroids.sigma_px, self.settings.searched_sigma_px)
+        return sigma_px / self.camera.focal_px
+
 
 def brightest(centroids: Centroids, settings: Settings) -> Centroids:
     """Return the brightest centroids, 2 * base_stars at most, for identification."""
     return centroids.take(np.arange(min(len(centroids), 2 * settings.base_stars)))
-
-
-def direction_sigma_rad(centroids: Centroids, camera: Camera, settings: Settings) -> Floats:
-    """Return the (N,) standard deviation of a direction, rad, from the centroid's own error and the floor."""
-    return np.hypot(centroids.sigma_px, settings.searched_sigma_px) / camera.focal_px
 
 
 def away_from_border(box_px: NDArray, camera: Camera) -> NDArray:

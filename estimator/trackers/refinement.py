@@ -19,6 +19,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids
+from estimator.core.vectors import rms
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.direct_match import mutual_nearest
 from estimator.identification.refusals import NO_MATCH, WRONG_SCALE
@@ -124,7 +125,7 @@ class FieldMatcher:
             lens.cam_from_ref.as_quat(),
             lens.covariance_rad2,
             solution.focal_ratio,
-            float(np.sqrt(np.mean(residual_px**2))) / self.camera.focal_px,
+            rms(residual_px) / self.camera.focal_px,
             chi2,
             dex,
         )

@@ -33,6 +33,7 @@ from estimator.attitude.systematic import geometry
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
+from estimator.core.vectors import lengths
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
 from estimator.identification.refusals import NO_LIGHTS, NO_STARS
 
@@ -69,9 +70,7 @@ class Lights(NamedTuple):
     @property
     def sight(self) -> Sight:
         """Sight of all lights, at their median distance."""
-        return Sight(
-            self.lever_cam_m, float(np.median(np.linalg.norm(self.place_ref, axis=1)))
-        )
+        return Sight(self.lever_cam_m, float(np.median(lengths(self.place_ref))))
 
 
 def solve_lights(
@@ -145,7 +144,7 @@ def _solve_with(
         exact = replace(fitted, covariance_rad2_s2=np.zeros((3, 3)))
         # Identified lights are at their own distance, others at the median one.
         radius_m = np.full(len(centroids), lights.sight.radius_m)
-        radius_m[match.observed] = np.linalg.norm(lights.place_ref[match.star], axis=1)
+        radius_m[match.observed] = lengths(lights.place_ref[match.star])
         sight = Sight(lights.lever_cam_m, radius_m)
         attitude = solve_global(at_middle_row(camera, centroids, exact, sight))
     # 4. Error of the rate
@@ -258,7 +257,7 @@ def _lens(attitude: Attitude, camera: Camera) -> Camera:
 
 def _radii(lights: Lights, places: Floats) -> Sight:
     """Return the sight of identified lights: each at its own distance from the bearing, which no attitude changes."""
-    return Sight(lights.lever_cam_m, np.linalg.norm(places, axis=1))
+    return Sight(lights.lever_cam_m, lengths(places))
 
 
 def with_streak_rate(

@@ -32,7 +32,7 @@ from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
 from estimator.core.least_squares import variance_factor
 from estimator.core.types import Attitude, Centroids, RateEstimate, StarMatch
-from estimator.core.vectors import rotation_of
+from estimator.core.vectors import lengths, rms, rotation_of
 from estimator.identification import star_evidence, star_quads, star_search
 from estimator.identification.refusals import (
     BUDGET,
@@ -463,7 +463,7 @@ class StarTracker(FrameTracker):
             cam_from_ref.as_quat(),
             covariance(rays, np.sqrt(variance) * sigma_rad, solver),
             1.0,
-            float(np.sqrt(np.mean(residual_px**2))) / self.camera.focal_px,
+            rms(residual_px) / self.camera.focal_px,
             chi2,
             float("nan"),
         )
@@ -488,7 +488,7 @@ class StarTracker(FrameTracker):
         relative_error = max(relative_error, self.camera.focal_sigma)
         if relative_error == 0:
             return sigma_px
-        radius_px = np.linalg.norm(centroids.xy_px - self.camera.center_px, axis=1)
+        radius_px = lengths(centroids.xy_px - self.camera.center_px)
         return np.hypot(sigma_px, relative_error * radius_px)
 
     def detections(

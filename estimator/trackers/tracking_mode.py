@@ -376,8 +376,9 @@ class TrackingMode:
         priors = FramePriors(streak_px, settings.saturation, reject=settings.reject)
         # Long streaks need the streak filter: the whole frame is processed.
         if streak_px is not None and np.hypot(*streak_px) > LONGEST_STREAK_PX:
-            camera = self.tracker.camera
-            return detect_and_centroid(image, camera, settings, clock, streak_px), False
+            return detect_and_centroid(
+                image, self.tracker.camera, settings, clock, streak_px
+            ), False
         image = monochrome(image, settings)
         image, blobs = cleaned(
             in_windows, image, priors, window_centers_px, self.reach_px, WINDOW_SIGMA

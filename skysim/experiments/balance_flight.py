@@ -95,15 +95,13 @@ class Assumptions(NamedTuple):
     Attributes
     ----------
     prior
-        Prior of the parameters (`estimator.calibration.mass_properties`)
-    lab
-        Gravity, Earth rate, wheel axes, level of the random torque
+        Prior of the parameters, with gravity, Earth rate, wheel axes and level of the random torque
+        (`estimator.calibration.mass_properties`)
     wheel_inertia_kg_m2
         (n,) assumed axial inertias
     """
 
     prior: Prior
-    lab: LabConstants
     wheel_inertia_kg_m2: Floats
 
 
@@ -133,11 +131,11 @@ def draw_assumptions(
     sigma = np.append(inertia_sigma, np.repeat(rest, [3, 3, 1, 1, 3, count]))
     values = np.zeros(PARAMETERS + count)
     values[:6] = inertia_six(true_kg_m2) + inertia_sigma * rng.standard_normal(6)
-    wheels = at_zero.wheels.inertia_kg_m2
-    assumed_wheels = wheels / (1 + uncertainty.wheel_sigma * rng.standard_normal(count))
-    return Assumptions(
-        Prior(values, sigma), known_lab(scene, at_zero, uncertainty), assumed_wheels
+    assumed_wheels = at_zero.wheels.inertia_kg_m2 / (
+        1 + uncertainty.wheel_sigma * rng.standard_normal(count)
     )
+    lab = known_lab(scene, at_zero, uncertainty)
+    return Assumptions(Prior(values, sigma, lab), assumed_wheels)
 
 
 def known_lab(scene: Scene, vehicle: VehicleModel, uncertainty: Uncertainty) -> LabConstants:

@@ -54,7 +54,6 @@ from skysim.results.report import (
     Table,
     Text,
     Verdict,
-    text_column,
 )
 from skysim.results.telemetry_report import AXES, EULER, euler_deg
 from skysim.scene.scene import Scene
@@ -194,7 +193,7 @@ def balance(
         )
         records.append(flown.record)
         with refusing(ImageError, "balance"):  # it does not converge
-            estimate = estimate_with_noise(records, assumptions.lab, assumptions.prior)
+            estimate = estimate_with_noise(records, assumptions.prior)
         iteration = Iteration(flown, estimate, vehicle.gravity_m_s2, position_m)
         if plan.moves and iteration.torque_bound_nm > plan.torque_bar_nm:
             position_m = balanced_position_m(flown.vehicle, iteration.moment_kg_m, scene)
@@ -273,7 +272,6 @@ def statistics(scene: str, plan: BalancePlan, iterations: Sequence[Iteration]) -
 
 def flight_row(number: int, one: Iteration) -> Record:
     """Numbers of one flight; names that begin with `true` are of the simulated vehicle."""
-    trims = one.flight.vehicle.trims
     mass = one.flight.vehicle.mass
     per_um = 1e6 / mass.mass_kg
     return {
@@ -283,7 +281,7 @@ def flight_row(number: int, one: Iteration) -> Record:
         "solved": one.flight.solved,
         "after_contact": one.flight.after_contact,
         "tilt_deg": largest_tilt_deg([one.flight.record]),
-        "trim_mm": (1e3 * trims.position_m).tolist(),
+        "trim_mm": (1e3 * one.flight.vehicle.trims.position_m).tolist(),
         "next_trim_mm": (1e3 * one.next_m).tolist(),
         "offset_um": (per_um * one.moment_kg_m).tolist(),
         "offset_sigma_um": (per_um * one.estimate.sigma[MOMENT]).tolist(),
@@ -355,7 +353,7 @@ def draw_flights(fig: Any, statistics: Record, record: BearingRecord) -> None:
 def filter_rows(one: Iteration, assumptions: Assumptions) -> list[Record]:
     """As `estimate_rows`, for the filter in flight at the end of one iteration. Raises InputError for few attitudes."""
     with refusing(ImageError, "balance"):
-        *_, last = filter_mass(one.flight.record, assumptions.lab, assumptions.prior)
+        *_, last = filter_mass(one.flight.record, assumptions.prior)
     return estimate_rows(one.flight, last)
 
 
@@ -447,7 +445,7 @@ def offset_text(flight: Record) -> str:
 def mass_blocks(rows: Sequence[Record], trims: bool) -> list[Block]:
     """Estimates of the mass properties beside the simulated vehicle's, which may have trim masses."""
     heads = ("estimate", "1σ", "simulated vehicle")
-    columns = [text_column("what"), *(Column(head, format=".5g") for head in heads)]
+    columns = ["what", *(Column(head, format=".5g") for head in heads)]
     values = [[row[key] for key in ("what", "estimate", "sigma", "truth")] for row in rows]
     for row in values:
         # A true value far below the standard error is rounding.

@@ -35,9 +35,9 @@ from skysim.experiments.dataset_shards import (
     coco_file,
     coco_image,
     frame_labels,
-    index_table,
     label_frame,
     labeller,
+    parquet,
     shard_name,
     sources_table,
 )
@@ -385,7 +385,10 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
         shard_name(SOURCES, shard, "parquet"),
         sources_table(list(frames), sources),
     )
-    storage.write(shard_name(INDEX, shard, "parquet"), index_table(rows))
+    storage.write(
+        shard_name(INDEX, shard, "parquet"),
+        parquet({name: [row[name] for row in rows] for name in rows[0]}),
+    )
     return ShardResult(shard, len(rows))
 
 

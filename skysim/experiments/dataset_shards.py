@@ -558,11 +558,6 @@ def parquet(columns: Record) -> bytes:
     return bytes(sink.getvalue())
 
 
-def index_table(rows: list[Record]) -> bytes:
-    """The index of a shard: a row for each frame."""
-    return parquet({name: [row[name] for row in rows] for name in rows[0]})
-
-
 def sources_table(frames: list[int], sources: list[Array]) -> bytes:
     """The sources of a shard: a row for each source of each frame."""
     rows = np.concatenate(sources)

@@ -56,7 +56,6 @@ from skysim.results.report import (
     Section,
     Table,
     Verdict,
-    text_column,
 )
 from skysim.results.telemetry_report import EULER, euler_deg
 from skysim.scene.scene import Scene
@@ -428,7 +427,7 @@ def calibration_report(
         ],
     )
     difference = Table(
-        [text_column("camera minus IMU, absolute"), *angles()],
+        ["camera minus IMU, absolute", *angles()],
         [[name, *values] for name, values in numbers["difference_deg"].items()],
     )
     sections = [

@@ -10,7 +10,7 @@ import math
 import re
 import textwrap
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import InitVar, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -74,11 +74,6 @@ class Column(NamedTuple):
         )
 
 
-def text_column(title: str) -> Column:
-    """Head of a column of texts."""
-    return Column(title, kind="text")
-
-
 @dataclass(frozen=True, kw_only=True)
 class Block:
     """A part of a report.
@@ -127,13 +122,20 @@ class Table(Block):
 
     Attributes
     ----------
+    heads
+        The columns; a text alone is the title of a column of texts
     optional
         Groups of columns that are left out on a narrow terminal, the first group first
     """
 
-    columns: Sequence[Column]
+    heads: InitVar[Sequence[Any]]
+    columns: list[Column] = field(init=False)
     rows: Sequence[Sequence[Any]]
     optional: Sequence[Sequence[int]] = ()
+
+    def __post_init__(self, heads: Sequence[Any]) -> None:
+        columns = [Column(one, kind="text") if isinstance(one, str) else one for one in heads]
+        object.__setattr__(self, "columns", columns)
 
     def cells(self) -> list[list[Cell]]:
         """The rows as cells."""

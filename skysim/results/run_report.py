@@ -25,7 +25,6 @@ from skysim.results.report import (
     Text,
     Tone,
     Verdict,
-    text_column,
 )
 from skysim.results.requirements import NOT_MET, Judgment
 from skysim.results.scoring import FrameRow
@@ -308,7 +307,7 @@ def frame_table(angles: tuple[str, str, str], rows: Rows) -> Table:
         Column("detected"),
         Column("used"),
         Column("time", "ms", ".1f"),
-        text_column("status"),
+        "status",
     ]
     lines = []
     for row in rows:

@@ -106,8 +106,9 @@ class ExternalTracker(FrameTracker, TrackerProgram):
             arguments, image_format = split_command(name, commands[name])
         else:
             arguments, environment = host_command("skysim.tracking.tracker_host", name)
-        limit_s = scene.tracker.time_limit_s
-        return cls(name, arguments, image_format, setup, limit_s, environment)
+        return cls(
+            name, arguments, image_format, setup, scene.tracker.time_limit_s, environment
+        )
 
     def solve_frame(
         self, frame: Frame, streak_px: tuple[float, float] | None = None

@@ -23,7 +23,7 @@ from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
 from skysim.camera.optics import Optics
 from skysim.core.errors import InputError, refusing
-from skysim.core.types import UP, Floats, Ints, Mount, Sources
+from skysim.core.types import UP, Floats, Ints, Mount, Sources, median
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import CollimatedDisplayConfig, DomeConfig
@@ -191,7 +191,7 @@ def surveyed_dome(
     # 2. The surveyed values.
     board = None if leds.board is None else leds.board[row]
     own_m2 = dome_map.own_m2
-    sigma_m = float(np.median(dome_map.sigma_m))
+    sigma_m = median(dome_map.sigma_m)
     if own_m2 is not None:
         across_m = survey_errors.across_sigma_m(dome_map.position_m, own_m2)
         sigma_m = min(sigma_m, float(across_m.max()))

@@ -24,6 +24,7 @@ from skysim.experiments.balance_procedure import BalancePlan
 from skysim.scene import loader
 from skysim.scene.scene import Scene
 from skysim.simulation.flight import Flight, Progress
+from tests.helpers.bearing_motion import SMALL
 
 SIGMA_RAD = 5e-5
 UNCERTAINTY = balance_flight.parse_uncertainty("10%", "500 um", "0.1%", "0.03 deg", 1.0)
@@ -196,7 +197,7 @@ def record_of(rate_deg_s: float) -> BearingRecord:
 def test_an_undetermined_quantity_is_named_with_a_sufficient_maneuver() -> None:
     """Information beyond the assumed grows with time and with the square of the motion."""
     sigma = np.array([*[0.1] * 3, *[0.05] * 3, *[1e-3] * 3, *[1.0] * 11])
-    prior = Prior(np.array([1.0] * 3 + [0.0] * 17), sigma)
+    prior = Prior(np.array([1.0] * 3 + [0.0] * 17), sigma, SMALL.lab)
     known = sigma.copy()
     known[:9] = 1e-3, 1e-3, 0.04, *[1e-3] * 3, 1e-6, 1e-6, 1e-6
 
@@ -365,7 +366,7 @@ def test_the_lab_is_known_as_the_scene_has_it() -> None:
 def test_each_quantity_is_held_to_its_own_bar() -> None:
     """Of moments of inertia 1, 2 and 4, and of moments along each axis with bars of their own."""
     sigma = np.array([*[0.5] * 3, *[0.05] * 3, *[1e-3] * 3, *[1.0] * 11])
-    prior = Prior(np.array([1.0, 2.0, 4.0] + [0.0] * 17), sigma)
+    prior = Prior(np.array([1.0, 2.0, 4.0] + [0.0] * 17), sigma, SMALL.lab)
     values = np.array([1.0, -2.0, 4.0] + [0.0] * 17)
     bars = np.array([1e-5, 2e-5, 3e-5])
     flown = balance_flight.Excitation(8.0, 29.0, 1.0)

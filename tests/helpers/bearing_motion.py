@@ -54,6 +54,11 @@ class Vehicle:
             GRAVITY_M_S2, np.eye(3), np.full(3, self.torque_rms_nm), self.correlation_s
         )
 
+    @property
+    def known(self) -> Prior:
+        """The true values, as if they were assumed."""
+        return Prior(self.truth, np.ones(20), self.lab)
+
 
 INERTIA = np.array([[0.11, 0.004, -0.002], [0.004, 0.13, 0.003], [-0.002, 0.003, 0.09]])
 SMALL = Vehicle(
@@ -159,4 +164,4 @@ def prior(vehicle: Vehicle, rng: np.random.Generator) -> tuple[Prior, Vehicle]:
     true = replace(vehicle, bias_rad=tuple(bias), wheel_errors=tuple(wheels))
     assumed = vehicle.truth + sigma * rng.standard_normal(20)
     assumed[14:] = 0
-    return Prior(assumed, sigma), true
+    return Prior(assumed, sigma, true.lab), true

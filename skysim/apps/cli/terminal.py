@@ -17,7 +17,6 @@ from skysim.results.report import (
     Table,
     print_table,
     print_wrapped,
-    text_column,
 )
 
 if TYPE_CHECKING:
@@ -117,7 +116,7 @@ def fail_if_not_met(judged: Iterable[Mapping[str, Any]]) -> None:
 def print_scores(lines: list[TrackerScore], folder: Path) -> None:
     """Print the scoreboard of a comparison, and the reasons for unsolved frames."""
     columns = [
-        text_column("tracker"),
+        "tracker",
         Column("frames"),
         Column("right", "%", ".1f"),
         *map(Column, ("(95 %)", "wrong", "refused", "failed")),
@@ -153,23 +152,22 @@ def print_scores(lines: list[TrackerScore], folder: Path) -> None:
 
 def print_solutions(solutions: list[Record], out: Path) -> None:
     """Print the attitudes of pictures of the sky, or of a dome's LEDs, with remarks."""
-    columns = [text_column("file"), text_column("status")]
     if "leds" in solutions[0]:
         keys = (
             "roll_deg pitch_deg yaw_deg cross_sigma_arcsec roll_sigma_arcsec matches rms_px"
         )
-        columns += [Column(name, "°", ".4f") for name in ("roll", "pitch", "yaw")]
+        columns = [Column(name, "°", ".4f") for name in ("roll", "pitch", "yaw")]
         columns += [Column(name, "″", ".3g") for name in ("cross 1σ", "roll 1σ")]
         columns += [Column("LEDs"), Column("rms px", "", ".2f")]
     else:
         keys = "ra_deg dec_deg roll_deg fov_deg matches rms_arcsec"
-        columns += [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
+        columns = [Column(name, "°", ".4f") for name in ("RA", "Dec", "roll", "fov")]
         columns += [Column("stars"), Column("rms", "″", ".1f")]
     rows = []
     for one in solutions:
         status = one["status"] if one["time_ms"] is not None else "bad input"
         rows.append([one["file"], status, *(one[key] for key in (*keys.split(), "time_ms"))])
-    print_table(Table([*columns, Column("ms", format=".0f")], rows))
+    print_table(Table(["file", "status", *columns, Column("ms", format=".0f")], rows))
     for solution in solutions:
         print_remarks(solution)
     print(f"annotated images and solutions.json in {out}")

@@ -37,7 +37,6 @@ from skysim.results.report import (
     Section,
     Table,
     Verdict,
-    text_column,
 )
 from skysim.scene import loader
 from skysim.scene.camera_sheet import PLACEHOLDER_LENS, SheetLine, yaml_lines
@@ -106,11 +105,11 @@ def facts(statistics: Record) -> Facts:
 def value_table(statistics: Record) -> Table:
     """The measured values with their intervals, beside the values of the camera's file."""
     columns = [
-        text_column("what"),
+        "what",
         Column("measured"),
         Column("95 %"),
         Column("file", format=".5g"),
-        text_column("unit"),
+        "unit",
     ]
     night = statistics["night"]
     rows = []

@@ -318,7 +318,7 @@ def check_dark(folder: Path, level: Level) -> None:
     """Raise InputError for a level of darks that is cut off at 0, has identical frames, or has structure or stars."""
     which = f"the darks of {describe(level)}"
     mean = level.mean_dn
-    noise_dn = max(math.sqrt(np.median(level.variance_dn2)), 0.3)
+    noise_dn = max(math.sqrt(median(level.variance_dn2)), 0.3)
     zeros = float(np.mean(mean < 1))
     if zeros > MAX_ZEROS:
         raise InputError(
@@ -340,7 +340,7 @@ def check_dark(folder: Path, level: Level) -> None:
         )
     # Hot pixels are single, except those that touch by chance; images of stars cover several pixels. A track of a
     # particle is in one half of the frames.
-    bright = level.halves_dn.min(axis=0) > np.median(mean) + SPOT_SIGMAS * max(
+    bright = level.halves_dn.min(axis=0) > median(mean) + SPOT_SIGMAS * max(
         median_and_spread(mean)[1], noise_dn / math.sqrt(level.count)
     )
     labels, _ = ndimage.label(bright, np.ones((3, 3)))

@@ -142,8 +142,9 @@ def require_fields(fields: int, solved: int, least: int, problem: str) -> None:
 
 def unit_seeds(scene: Scene) -> list[str]:
     """Keys of the seeds that differ from unit to unit: chip, survey, LEDs."""
-    chip = scene.camera.detector
-    has_pattern = any(getattr(chip, key) for key in scene_changes.FIXED_PATTERN)
+    has_pattern = any(
+        getattr(scene.camera.detector, key) for key in scene_changes.FIXED_PATTERN
+    )
     seeds = ["camera.detector.hardware_seed"] if has_pattern else []
     return seeds + dome_seeds(scene)
 

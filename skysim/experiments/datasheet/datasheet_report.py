@@ -36,7 +36,6 @@ from skysim.results.report import (
     Text,
     Verdict,
     figure_files,
-    text_column,
 )
 
 ECSS_TERMS = (
@@ -366,7 +365,7 @@ def section_blocks(section: StatementSection, statement: Statement) -> list[Bloc
     columns = [
         Column(head, kind="aside" if head == "what it is" else "number") for head in others
     ]
-    return [*texts, *figures, Table([text_column(first), *columns], section.rows)]
+    return [*texts, *figures, Table([first, *columns], section.rows)]
 
 
 # The second page.
@@ -379,9 +378,8 @@ def standard_section(statement: Statement) -> Section:
     for term, title, how in list(csv.reader(ECSS_TERMS.read_text().splitlines()))[1:]:
         where = title if title in stated else "not on this sheet" if how else "not here"
         rows.append([term, where, how])
-    columns = [text_column(name) for name in ("term", "section", "how")]
     title = "What ECSS practice asks and where it is here"
-    return Section(title, [Table(columns, rows)], on_terminal=False)
+    return Section(title, [Table(("term", "section", "how"), rows)], on_terminal=False)
 
 
 def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, Path]:

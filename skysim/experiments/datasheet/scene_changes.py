@@ -30,7 +30,6 @@ def catalog_end_mag(scene: Scene) -> float:
 def causes(scene: Scene) -> Changes:
     """Changes of the scene that would lower the error; those without effect on it are left out."""
     camera = scene.camera
-    chip = camera.detector
     exposure = scene.exposure
     changes: Changes = {
         "twice the light (aperture)": {"camera.f_number": camera.f_number / math.sqrt(2)}
@@ -41,7 +40,9 @@ def causes(scene: Scene) -> Changes:
         reference = {"kind": "steady", "temperature_c": scene.thermal.reference_c}
         changes["the temperature held"] = {"thermal.temperature": reference}
     better: Changes = {
-        "half the read noise": {"camera.detector.read_noise_e": chip.read_noise_e / 2},
+        "half the read noise": {
+            "camera.detector.read_noise_e": camera.detector.read_noise_e / 2
+        },
         "no fixed pattern": {f"camera.detector.{key}": 0 for key in FIXED_PATTERN},
         "no transfer loss": {
             "camera.detector.cti_parallel": 0,

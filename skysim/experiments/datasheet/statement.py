@@ -355,8 +355,7 @@ def rate_section(statement: Statement) -> StatementSection:
     The relative error of rms and NEA of F fields is 1 / sqrt(2 F) about two axes, 1 / sqrt(F) about one: for two
     Gaussian values per field and axis, if the scatter of the fields' variances doubles the square of the error.
     """
-    fields = statement.sheet.size.fields
-    across, about = (100 / math.sqrt(axes * fields) for axes in (2, 1))
+    across, about = (100 / math.sqrt(axes * statement.sheet.size.fields) for axes in (2, 1))
     texts = [
         "Two frames of each attitude that differ in their noise, at a constant rate across the boresight, each lost in"
         f" space. NEA: temporal noise of one axis, 1 σ ({TEMPORAL}). rms: all errors of one axis ({ONE_UNIT})."

@@ -19,7 +19,7 @@ from estimator.calibration import dome_survey, survey_faults, survey_subset
 from estimator.calibration.bundle_adjustment import Assumed
 from estimator.calibration.dome_survey import DomeFrame, DomeSurvey
 from skysim.core.errors import InputError
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, median
 from skysim.experiments.dome_survey.survey_findings import (
     SurveyRun,
     identified,
@@ -32,6 +32,7 @@ from skysim.experiments.dome_survey.survey_frames import (
     SurveyFrame,
     match_by_imu,
     match_by_survey,
+    survey_model,
 )
 from skysim.simulation.flight import Progress
 from skysim.tracking.dome_map_file import DomeMap
@@ -130,7 +131,7 @@ def survey_in_rounds(
         return with_names(SurveyRun(survey, frames, kept, listed, prior))
 
     listed = prior.leds
-    before = assumed(prior)
+    before = survey_model(prior, prior.floor_px).assumed
     total = ROUNDS + MOVED_ROUNDS
     start = {row: frame.body_from_lab for row, frame in enumerate(frames)}
     run = adjusted(identified_by_imu(frames, prior), prior)
@@ -147,16 +148,6 @@ def survey_in_rounds(
         watch(total, total)
     check_plausible(run, before)
     return run
-
-
-def assumed(prior: CalibrationPrior) -> Assumed:
-    """Lever and focal length before a survey, which enter its adjustment as measurements."""
-    camera = prior.camera
-    uncertainty = prior.uncertainty
-    arm_m = prior.lever.camera_body_m
-    return Assumed(
-        arm_m, uncertainty.lever_sigma_m, camera.focal_px, uncertainty.focal_sigma_px(camera)
-    )
 
 
 def check_plausible(run: SurveyRun, before: Assumed) -> None:
@@ -197,7 +188,7 @@ def identified_by_imu(frames: Sequence[SurveyFrame], prior: CalibrationPrior) ->
         matched_share(frame, match, prior)
         for frame, match in zip(frames, matches, strict=True)
     ]
-    least = max(MIN_MATCHED, MIN_OF_MEDIAN * float(np.median(shares)))
+    least = max(MIN_MATCHED, MIN_OF_MEDIAN * median(shares))
     rows = np.flatnonzero(np.array(shares) >= least).tolist()
     if not rows:
         raise InputError(
@@ -368,9 +359,8 @@ def led_visibility(
     Such an LED, seen from camera positions close together, has no measurable distance and connects no frames.
     """
     visible = identified([match for _, match in pairs], len(prior.leds.id))
-    arm_m = prior.lever.camera_body_m
     camera_m = np.array(
-        [frame.body_from_lab.inv().apply(arm_m) for frame, _ in pairs]
+        [frame.body_from_lab.inv().apply(prior.lever.camera_body_m) for frame, _ in pairs]
     ).reshape(-1, 3)
     angle_rad = survey_subset.ray_angles(
         prior.leds.position_m, camera_m, *np.nonzero(visible)

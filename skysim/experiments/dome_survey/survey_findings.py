@@ -11,10 +11,11 @@ from scipy.spatial.transform import Rotation
 
 from estimator.attitude.dome_map import LedMap, Lever, project
 from estimator.calibration import survey_faults, survey_plan
+from estimator.calibration.bundle_adjustment import Sightings
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.calibration.survey_faults import LightTable
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
-from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths
+from skysim.core.types import UP, Bools, Floats, Record, frozen, lengths, median
 from skysim.experiments.dome_survey.survey_frames import (
     ANGLES,
     GATE_SIGMAS,
@@ -76,6 +77,15 @@ class SurveyRun:
         ]
 
     @property
+    def sightings(self) -> Sightings:
+        """All correspondences that were not rejected, frame by frame."""
+        pairs = self.pairs
+        return Sightings.of(
+            [frame.lights.take(match.light) for frame, match in pairs],
+            np.concatenate([match.led for _, match in pairs]),
+        )
+
+    @property
     def seen(self) -> Bools:
         """(F, N) mask of the LEDs identified in each frame."""
         return identified([match for _, match in self.pairs], len(self.listed.id))
@@ -83,10 +93,7 @@ class SurveyRun:
     @property
     def noise_px(self) -> float:
         """Standard deviation of a centroid's coordinates by the residuals, for the mean information."""
-        sigma_px = np.concatenate(
-            [frame.lights.sigma_px[match.light] for frame, match in self.pairs]
-        )
-        return self.survey.noise_scale / math.sqrt(np.mean(sigma_px**-2.0))
+        return self.survey.noise_scale / math.sqrt(np.mean(self.sightings.sigma_px**-2.0))
 
     @property
     def accuracy(self) -> SurveyAccuracy:
@@ -120,10 +127,7 @@ class SurveyRun:
 
 def identified(matches: Sequence[Correspondences], leds: int) -> Bools:
     """(F, N) mask of the LEDs in the correspondences of each frame."""
-    out = np.zeros((len(matches), leds), dtype=bool)
-    for row, match in zip(out, matches, strict=True):
-        row[match.led] = True
-    return out
+    return np.array([np.isin(np.arange(leds), match.led) for match in matches])
 
 
 def stray_lights(run: SurveyRun) -> list[Floats]:
@@ -146,17 +150,11 @@ def stray_lights(run: SurveyRun) -> list[Floats]:
 def residuals_px(run: SurveyRun) -> tuple[Floats, Floats]:
     """(M, 2) pixels of all correspondences except outliers, and their residuals, detected minus predicted."""
     survey = run.survey
-    found = [np.zeros((0, 2))]
-    residual = [np.zeros((0, 2))]
-    for (frame, match), tied in zip(run.pairs, survey.tied, strict=True):
-        used = survey.surveyed[match.led] & tied
-        xy_px = frame.lights.xy_px[match.light[used]]
-        place_m = survey.leds.position_m[match.led[used]]
-        found.append(xy_px)
-        residual.append(
-            xy_px - project(frame.body_from_lab, place_m, survey.lever, survey.camera)
-        )
-    return np.concatenate(found), np.concatenate(residual)
+    every = run.sightings
+    used = every.take(survey.surveyed[every.led] & survey.tied[every.frame])
+    place_m = survey.leds.position_m[used.led]
+    held = survey.body_from_lab[used.frame]
+    return used.xy_px, used.xy_px - project(held, place_m, survey.lever, survey.camera)
 
 
 def light_table(run: SurveyRun) -> LightTable:
@@ -204,10 +202,9 @@ class Coverage(NamedTuple):
 
 def coverage(run: SurveyRun) -> Coverage:
     """The coverage of a survey."""
-    survey = run.survey
     known = run.found._replace(uncertainty=run.prior.uncertainty)
     model = survey_model(known, run.noise_px)
-    return Coverage(model, survey.body_from_lab, run.seen, run.accuracy)
+    return Coverage(model, run.survey.body_from_lab, run.seen, run.accuracy)
 
 
 def coverage_before(
@@ -298,7 +295,7 @@ def find_faults(run: SurveyRun) -> Record:
         "displaced": {int(leds.id[row]): float(off_m[row]) for row in rows},
         "list_sigma_m": sigma_m,
         "tested": len(size_m),
-        "tested_m": float(np.median(size_m)) if len(size_m) else None,
+        "tested_m": median(size_m) if len(size_m) else None,
         "exchanged": [
             (int(leds.id[x.led]), int(leds.id[x.shows]), leds.id[list(x.or_any_of)].tolist())
             for x in exchanges

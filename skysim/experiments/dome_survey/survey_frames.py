@@ -30,6 +30,7 @@ from skysim.core.types import (
     around_z,
     frozen,
     lengths,
+    median,
 )
 from skysim.core.units import quantities_within
 from skysim.scene.scene import Scene
@@ -202,9 +203,8 @@ def prior_of(lab: Lab, camera: Camera, leds: LedMap) -> CalibrationPrior:
         else None
     )
     floor_px = scene.tracker.centroid_sigma_px or factory.DOME_SIGMA_PX
-    disk_m = light.led.disk_diameter_m
     return CalibrationPrior(
-        camera, leds, lever, floor_px, disk_m, levels / levels.max(), code
+        camera, leds, lever, floor_px, light.led.disk_diameter_m, levels / levels.max(), code
     )
 
 
@@ -417,7 +417,7 @@ def centroid_noise_px(lab: Lab, tilt_deg: float) -> float:
             f"{len(error_px)} lights in {NOISE_FRAMES} frames",
             f"{MIN_LIGHTS} or more: brighter LEDs, more of them, or a longer exposure",
         )
-    return max(float(np.median(np.abs(error_px))) / MAD_PER_SIGMA, LEAST_NOISE_PX)
+    return max(median(np.abs(error_px)) / MAD_PER_SIGMA, LEAST_NOISE_PX)
 
 
 def imu_attitudes(scene: Scene, lab_from_body: Rotation, sigma_rad: float) -> Rotation:

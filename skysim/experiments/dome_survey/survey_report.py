@@ -14,7 +14,7 @@ from estimator.attitude.dome_map import Lever, on_surface
 from estimator.calibration.dome_survey import DomeSurvey
 from estimator.core.camera import Camera
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth, lengths
+from skysim.core.types import UP, Bools, Floats, Frame, Mount, Record, Truth, lengths, median
 from skysim.experiments.dome_survey.adjust import lens_sigma
 from skysim.experiments.dome_survey.survey_findings import (
     Coverage,
@@ -39,7 +39,6 @@ from skysim.results.report import (
     Table,
     Text,
     Verdict,
-    text_column,
 )
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.lab import Lab
@@ -78,7 +77,7 @@ def survey_report(statistics: Record, run: SurveyRun, command: str) -> Report:
     """The report of a survey from the numbers of `survey.json`."""
     reached = accuracy_statistics(run.accuracy)
     faults = statistics["faults"]
-    columns = [Column("LED"), text_column("fault"), text_column("details")]
+    columns = [Column("LED"), "fault", "details"]
     rows = [row[:3] for row in fault_rows(faults)]
     dome = Figure(
         Path(statistics["picture"]).read_bytes(),
@@ -121,7 +120,7 @@ def value_table(statistics: Record) -> Table:
         )
         rows += [[what, before, found, f"{row['sigma']:.2g}", *known]] if row["sigma"] else []
     heads = ["before", "found", "1σ"] + ["truth"] * bool(truth)
-    return Table([text_column(""), *map(Column, heads)], rows)
+    return Table(["", *map(Column, heads)], rows)
 
 
 def truth_blocks(statistics: Record) -> list[Block]:
@@ -141,7 +140,7 @@ def truth_blocks(statistics: Record) -> list[Block]:
         rows.append([when, f"{one['solved']} / {one['stops']}", *errors])
     heads = ("cross, median", "worst", "roll, median", "worst")
     columns = [
-        text_column("the tracker"),
+        "the tracker",
         Column("solved"),
         *(Column(head, "″", ".3g") for head in heads),
     ]
@@ -162,7 +161,7 @@ def accuracy_table(statistics: Record, reached: Record) -> Table:
     rows = [
         [what, *(one.get(key) for one in given.values())] for key, what in REACHED.items()
     ]
-    return Table([text_column("1σ"), *(Column(head, format=".3g") for head in given)], rows)
+    return Table(["1σ", *(Column(head, format=".3g") for head in given)], rows)
 
 
 def coverage_blocks(statistics: Record) -> list[Block]:
@@ -313,7 +312,7 @@ def survey_statistics(run: SurveyRun, before: CalibrationPrior) -> Record:
         "rms_px": survey.rms_px,
         "noise_px": run.noise_px,
         "misfit": survey.misfit,
-        "led_sigma_mm_median": float(np.median(sigma_mm)),
+        "led_sigma_mm_median": median(sigma_mm),
         "led_sigma_mm_worst": float(sigma_mm.max()),
         "values": rows_of_columns(
             what=PARAMETERS,

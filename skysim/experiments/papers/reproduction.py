@@ -49,7 +49,6 @@ from skysim.results.report import (
     Text,
     Tone,
     Verdict,
-    text_column,
 )
 from skysim.scene import loader
 from skysim.simulation.flight import Progress, open_flight
@@ -376,8 +375,8 @@ def headline(reproductions: Sequence[Reproduction]) -> Verdict:
 def contents(reproductions: Sequence[Reproduction]) -> Table:
     """Verdicts and seconds of each experiment, with links."""
     columns = [
-        text_column("experiment"),
-        text_column(""),
+        "experiment",
+        "",
         *(Column(f"predictions: {kind}") for kind in VERDICTS),
         Column("rows"),
         Column("time", "s", ".0f"),
@@ -414,11 +413,11 @@ def section(reproduction: Reproduction) -> Section:
 def comparison_table(comparisons: Sequence[Comparison]) -> Table:
     """The published numbers beside ours."""
     columns = [
-        text_column("what"),
-        text_column("class"),
+        "what",
+        "class",
         Column("published"),
         Column("ours"),
-        text_column("verdict"),
+        "verdict",
         Column("note", kind="aside"),
     ]
     rows = []

@@ -244,12 +244,13 @@ def front(config: Search, candidates: Sequence[Candidate]) -> list[Candidate]:
     feasible = [one for one in candidates if one.feasible]
     sign = np.array([1.0 if one.better == "less" else -1.0 for one in config.objectives])
     values = np.array([one.objectives for one in feasible]).reshape(-1, len(sign)) * sign
-    best = [
-        (tuple(own), one)
-        for one, own in zip(feasible, values, strict=True)
-        if not np.any(np.all(values <= own, axis=1) & np.any(values < own, axis=1))
+    return [
+        feasible[n]
+        for n in np.lexsort(values.T[::-1])
+        if not np.any(
+            np.all(values <= values[n], axis=1) & np.any(values < values[n], axis=1)
+        )
     ]
-    return [one for _, one in sorted(best, key=lambda pair: pair[0])]
 
 
 def front_cells(study: Study, result: SearchResult) -> tuple[list[str], list[list[str]]]:

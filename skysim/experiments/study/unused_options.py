@@ -307,8 +307,9 @@ def find(key: str, plan: Plan, point: CheckedPoint) -> Fault | None:
 
 def has_effect_elsewhere(plan: Plan, point: CheckedPoint, key: str) -> bool:
     """Whether a key of one factor's level has an effect at some level of another factor, varied alone."""
-    factors = plan.study.factors
-    others = {name: factor for name, factor in factors.items() if name != point.factor}
+    others = {
+        name: factor for name, factor in plan.study.factors.items() if name != point.factor
+    }
     for *_, settings in each_level(others):
         scene, trial = resolve_point(plan.spec, settings | point.own)
         varied = point._replace(settings=settings | point.own, scene=scene, trial=trial)

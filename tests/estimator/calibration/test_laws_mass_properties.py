@@ -84,7 +84,9 @@ def test_momentum_in_the_lab_changes_by_external_torques_only(
     """Without gravity's moment, drag and torques H stays, whatever the wheels do; rate and slope agree."""
     free = SMALL.truth.copy()
     free[6:14] = 0
-    motion = EquationsOfMotion(RECORD, SMALL.lab, np.tile(free[:, None], 4), free)
+    motion = EquationsOfMotion(
+        RECORD, replace(SMALL.known, values=free), np.tile(free[:, None], 4)
+    )
     states = drawn_states(rng, 4)._replace(torque=np.zeros((3, 4)))
     begin = rng.uniform(0, 10, 4)
     after = motion.integrate(begin, begin + 3.0, states, 2.0)
@@ -111,7 +113,8 @@ def test_a_free_body_turns_against_the_stars_and_not_with_the_earth() -> None:
     sphere[6:] = 0.0
     still = replace(RECORD, wheel_momentum_nms=0 * RECORD.wheel_momentum_nms)
     lab = replace(SMALL.lab, earth_lab_rad_s=earth)
-    motion = EquationsOfMotion(still, lab, sphere[:, None], sphere)
+    known = replace(SMALL.known, values=sphere, lab=lab)
+    motion = EquationsOfMotion(still, known, sphere[:, None])
     states = drawn_states(np.random.default_rng(4), 1)._replace(torque=np.zeros((3, 1)))
     duration_s = 20.0
     after = motion.integrate(np.zeros(1), np.full(1, duration_s), states, 2.0)
@@ -129,9 +132,8 @@ AT_REST = States(np.array([[0.0], [0.0], [0.0], [1.0]]), np.zeros((3, 1)), np.ze
 
 def noise_after(duration_s: float) -> np.ndarray:
     """(9, 9) covariance of the states after a time, from no attitude error, momentum and torque."""
-    values = SMALL.truth
     return mass_dynamics.torque_noise(
-        np.array([duration_s]), RECORD, AT_REST, values, values, SMALL.lab
+        np.array([duration_s]), RECORD, AT_REST, SMALL.truth, SMALL.known
     )[0]
 
 
@@ -184,7 +186,7 @@ def test_the_noise_of_wheel_speeds_is_a_random_walk_of_the_attitude(sample_s: fl
     )
     lab = replace(SMALL.lab, wheel_sigma_nms=sigma_nms, torque_rms_nm=np.full(3, 1e-15))
     noise = mass_dynamics.torque_noise(
-        np.array([2.0]), sampled, AT_REST, SMALL.truth, SMALL.truth, lab
+        np.array([2.0]), sampled, AT_REST, SMALL.truth, replace(SMALL.known, lab=lab)
     )[0]
     inverse = np.linalg.inv(SMALL.inertia_kg_m2)
     one = inverse * sigma_nms * sample_s
@@ -196,14 +198,14 @@ def test_the_noise_of_wheel_speeds_is_a_random_walk_of_the_attitude(sample_s: fl
 def test_a_transition_matrix_predicts_small_changes(rng: np.random.Generator) -> None:
     """Of a state and of the parameters, by its derivatives; its noise is a covariance."""
     assumed, _ = prior(SMALL, rng)
-    states = mass_properties.first_states(RECORD, SMALL.lab, assumed.values).take(slice(0, 6))
-    link = mass_dynamics.transition(RECORD, SMALL.lab, 0, states, assumed.values, assumed)
+    states = mass_properties.first_states(RECORD, assumed, assumed.values).take(slice(0, 6))
+    link = mass_dynamics.transition(RECORD, 0, states, assumed.values, assumed)
     change = np.outer(np.repeat([1e-4, 1e-6, 1e-8], 3), np.ones(6)) * rng.standard_normal(
         (STATE, 6)
     )
     by = 1e-3 * assumed.sigma * rng.standard_normal(20)
     other = mass_dynamics.transition(
-        RECORD, SMALL.lab, 0, states.moved(change), assumed.values + by, assumed
+        RECORD, 0, states.moved(change), assumed.values + by, assumed
     )
     expected = np.einsum("kij,jk->ik", link.by_state, change) + (link.by_parameter @ by).T
     scale = np.repeat([1e-6, 1e-8, 1e-10], 3)[:, None]
@@ -227,12 +229,11 @@ def test_a_transition_matrix_predicts_small_changes(rng: np.random.Generator) ->
 @given(rng=SEEDS)
 def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) -> None:
     """The band of the states and their elimination against a dense inverse; more records, smaller errors."""
-    assumed, vehicle = prior(SMALL, rng)
-    lab = vehicle.lab
+    assumed, _ = prior(SMALL, rng)
     values = assumed.values
-    states = mass_properties.first_states(RECORD, lab, values)
-    part = mass_properties.reduced(RECORD, states, lab, values, assumed)
-    rows = mass_properties.whitened_links(RECORD, states, lab, values, assumed)
+    states = mass_properties.first_states(RECORD, assumed, values)
+    part = mass_properties.reduced(RECORD, states, values, assumed)
+    rows = mass_properties.whitened_links(RECORD, states, values, assumed)
     count = len(RECORD.t_s)
     size = len(values)
     whole = np.zeros((STATE * count + size + 1,) * 2)
@@ -243,11 +244,11 @@ def test_elimination_equals_the_whole_normal_matrix(rng: np.random.Generator) ->
     border = np.zeros((count, STATE, size + 1))
     corner = np.zeros((size + 1, size + 1))
     blocks = diagonal, border, corner
-    chi2 = mass_properties.add_measured(RECORD, states, lab, values, blocks)
+    chi2 = mass_properties.add_measured(RECORD, states, values, assumed, blocks)
     # A first torque of two standard deviations about each axis adds four for each.
-    pushed = states._replace(torque=states.torque + 2 * lab.torque_rms_nm[:, None])
+    pushed = states._replace(torque=states.torque + 2 * assumed.lab.torque_rms_nm[:, None])
     without = tuple(map(np.copy, blocks))
-    added = mass_properties.add_measured(RECORD, pushed, lab, values, without)
+    added = mass_properties.add_measured(RECORD, pushed, values, assumed, without)
     assert added - chi2 == pytest.approx(12)
     whole[STATE * count :, STATE * count :] += corner
     for k in range(count):
@@ -280,7 +281,7 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
 
     To 12 %, at errors of any size: Gauss and Newton leave out the curvature times the residuals.
     """
-    assumed, vehicle = prior(SMALL, rng)
+    assumed, _ = prior(SMALL, rng)
     error = 2e-5 * rng.standard_normal(3)
     systematic = np.zeros((len(RECORD.t_s), 3, 3))
     systematic[at] = np.outer(error, error)
@@ -300,8 +301,7 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
     turns[at] = error
     turned = replace(RECORD, lab_from_body=RECORD.lab_from_body * Rotation.from_rotvec(turns))
     before, after, considered = (
-        mass_properties.estimate_mass([one], vehicle.lab, assumed)
-        for one in (RECORD, turned, shared)
+        mass_properties.estimate_mass([one], assumed) for one in (RECORD, turned, shared)
     )
     change = (after.values - before.values) / before.sigma
     added = (considered.covariance - before.covariance) / np.outer(before.sigma, before.sigma)
@@ -313,7 +313,7 @@ def test_consider_covariance_is_the_effect_of_attitude_errors(
 @pytest.mark.parametrize("other", [7, 10, 26])
 def test_errors_are_shared_by_the_rotation_between_two_attitudes(other: int) -> None:
     """By exp(-rotation / angle) of what two attitudes share that are from the same lights, 4 to 7 degrees apart."""
-    assumed, vehicle = prior(SMALL, np.random.default_rng(5))
+    assumed, _ = prior(SMALL, np.random.default_rng(5))
     error = np.array([1e-5, -6e-6, 2e-5])
     systematic = np.zeros((len(RECORD.t_s), 3, 3))
     systematic[[2, other]] = np.outer(error, error)
@@ -321,7 +321,7 @@ def test_errors_are_shared_by_the_rotation_between_two_attitudes(other: int) -> 
     by_rotation = replace(independent, systematic_rad2=systematic)
     by_lights = replace(by_rotation, lights=np.ones((len(RECORD.t_s), 4)))
     apart, near, same = (
-        mass_properties.estimate_mass([one], vehicle.lab, assumed)
+        mass_properties.estimate_mass([one], assumed)
         for one in (independent, by_rotation, by_lights)
     )
     scale = np.outer(apart.sigma, apart.sigma)
@@ -336,9 +336,9 @@ def test_errors_are_shared_by_the_rotation_between_two_attitudes(other: int) -> 
 
 def test_the_first_momentum_of_a_filter_is_as_uncertain_as_its_rate() -> None:
     """0.01 rad/s about any body axis, times the inertia, if the mass properties are known: over drawn rates."""
-    assumed, vehicle = prior(SMALL, np.random.default_rng(6))
+    assumed, _ = prior(SMALL, np.random.default_rng(6))
     known = MassEstimate(assumed.values, 1e-20 * np.eye(20), 1.0)
-    covariance = mass_properties.first_covariance(known, RECORD, vehicle.lab)[3:6, 3:6]
+    covariance = mass_properties.first_covariance(known, RECORD, assumed)[3:6, 3:6]
     rates = 0.01 * np.random.default_rng(7).standard_normal((200_000, 3))
     momenta = RECORD.lab_from_body[1].apply(rates @ inertia_matrix(assumed.values[:6]))
     size = float(np.abs(covariance).max())
@@ -384,8 +384,8 @@ def test_an_estimate_is_read_from_its_state_vector(rng: np.random.Generator) -> 
 )
 @given(rng=SEEDS)
 def test_the_covariance_of_a_filter_never_grows(rng: np.random.Generator) -> None:
-    assumed, vehicle = prior(SMALL, rng)
-    estimates = list(mass_properties.filter_mass(RECORD, vehicle.lab, assumed))
+    assumed, _ = prior(SMALL, rng)
+    estimates = list(mass_properties.filter_mass(RECORD, assumed))
     assert len(estimates) == len(RECORD.t_s) - mass_properties.START - 2
     last = assumed.sigma
     for one in estimates:
@@ -393,13 +393,13 @@ def test_the_covariance_of_a_filter_never_grows(rng: np.random.Generator) -> Non
         assert (one.sigma <= last * (1 + 1e-9)).all()
         last = one.sigma
     begun = mass_properties.estimate_mass(
-        [mass_properties.cut(RECORD, slice(0, 20))], vehicle.lab, assumed
+        [mass_properties.cut(RECORD, slice(0, 20))], assumed
     )
-    whole = mass_properties.first_covariance(begun, RECORD, vehicle.lab)
+    whole = mass_properties.first_covariance(begun, RECORD, assumed)
     scale = np.sqrt(np.diag(whole))
     assert_covariance(whole / np.outer(scale, scale))
     rest = mass_properties.cut(RECORD, slice(20, None))
-    first = next(mass_properties.filter_from(begun, rest, vehicle.lab, assumed))
+    first = next(mass_properties.filter_from(begun, rest, assumed))
     np.testing.assert_array_equal(first.values, estimates[0].values)
 
 
@@ -408,7 +408,7 @@ def test_a_filter_s_misfit_is_the_chi_square_of_each_number_of_its_innovations()
 
     Three numbers an attitude, from the first innovation on.
     """
-    assumed, vehicle = prior(SMALL, np.random.default_rng(12))
+    assumed, _ = prior(SMALL, np.random.default_rng(12))
     part = mass_properties.cut(RECORD, slice(0, 6))
     sigma_rad = 1e3
     covariance_rad2 = part.covariance_rad2.copy()
@@ -416,28 +416,23 @@ def test_a_filter_s_misfit_is_the_chi_square_of_each_number_of_its_innovations()
     blind = replace(part, covariance_rad2=covariance_rad2)
     known = MassEstimate(assumed.values, 1e-12 * np.diag(assumed.sigma**2), 1.0)
     bias = Rotation.from_rotvec(assumed.values[mass_dynamics.BIAS])
-    states = mass_properties.first_states(blind, vehicle.lab, assumed.values).take(
-        slice(1, 2)
-    )
+    states = mass_properties.first_states(blind, assumed, assumed.values).take(slice(1, 2))
     chi2 = 0.0
-    estimates = list(mass_properties.filter_from(known, blind, vehicle.lab, assumed))
+    estimates = list(mass_properties.filter_from(known, blind, assumed))
     assert len(estimates) == 4
     for n, one in enumerate(estimates, 1):
-        states = mass_dynamics.transition(
-            blind, vehicle.lab, n, states, assumed.values, assumed
-        ).after
+        states = mass_dynamics.transition(blind, n, states, assumed.values, assumed).after
         off = (states.rotation[0] * bias).inv() * part.lab_from_body[n + 1]
         chi2 += off.magnitude() ** 2 / sigma_rad**2
         assert one.misfit / chi2 == pytest.approx(1 / (3 * n), rel=1e-3)
 
 
 def test_a_longer_record_has_smaller_errors() -> None:
-    assumed, vehicle = prior(SMALL, np.random.default_rng(3))
+    assumed, _ = prior(SMALL, np.random.default_rng(3))
     short, long = (
         mass_properties.estimate_mass(
             [mass_properties.cut(RECORD, slice(0, n))],
-            vehicle.lab,
-            Prior(SMALL.truth, assumed.sigma),
+            Prior(SMALL.truth, assumed.sigma, SMALL.lab),
         ).sigma
         for n in (12, 26)
     )
@@ -501,7 +496,8 @@ def test_a_motion_under_all_torques_is_that_of_its_equations(duration_s: float) 
     states = drawn_states(rng, 3)
     states = states._replace(momentum=3 * states.momentum, torque=0.02 * states.torque)
     begin_s = np.array([0.1, 0.6, 1.3])
-    motion = EquationsOfMotion(full, lab, np.tile(values[:, None], 3), assumed)
+    known = Prior(assumed, np.ones(len(assumed)), lab)
+    motion = EquationsOfMotion(full, known, np.tile(values[:, None], 3))
     after = motion.integrate(begin_s, begin_s + duration_s, states, tau)
     J = inertia_matrix(values[:6]) + added
     J0 = inertia_matrix(assumed[:6]) + added
@@ -543,7 +539,6 @@ def test_a_motion_under_all_torques_is_that_of_its_equations(duration_s: float) 
 
 def test_first_states_have_the_momentum_of_body_and_wheels() -> None:
     """The mean rate between two attitudes holds in the middle; at the ends that of the first and the last pair."""
-    lab = SMALL.lab
     t_s = np.array([0.0, 1.0, 3.0, 4.0, 4.5])
     axis = np.array([0.0, 0.6, 0.8])
     rates = np.array([0.01, 0.02, 0.04, 0.01])
@@ -561,7 +556,7 @@ def test_first_states_have_the_momentum_of_body_and_wheels() -> None:
     )
     values = SMALL.truth.copy()
     values[17:] = [0.1, 0.0, -0.1]
-    found = mass_properties.first_states(flown, lab, values)
+    found = mass_properties.first_states(flown, SMALL.known, values)
     middle_s = np.array([0.5, 2.0, 3.5, 4.25])
     rate = np.interp(t_s, middle_s, rates)
     inertia = SMALL.inertia_kg_m2 + np.diag([1e-3, 2e-3, 3e-3])
@@ -605,14 +600,14 @@ def test_the_misfit_of_a_fit_is_one_where_the_errors_are_as_assumed() -> None:
         short = mass_properties.cut(record(SMALL, rng, 26.0), slice(0, 9))
         assumed, _ = prior(SMALL, rng)
         drawn = SMALL.truth + assumed.sigma * rng.standard_normal(20)
-        known = Prior(drawn, assumed.sigma)
-        one = mass_properties.estimate_mass([short], SMALL.lab, known)
+        known = Prior(drawn, assumed.sigma, SMALL.lab)
+        one = mass_properties.estimate_mass([short], known)
         found.append(one.misfit)
         if seed == 0:
-            twice = mass_properties.estimate_mass([short, short], SMALL.lab, known)
+            twice = mass_properties.estimate_mass([short, short], known)
             assert twice.misfit == pytest.approx(one.misfit, rel=0.3)
             doubled = short.with_noise(9.0)
-            quiet = mass_properties.estimate_mass([doubled], SMALL.lab, known).misfit
+            quiet = mass_properties.estimate_mass([doubled], known).misfit
             assert quiet < one.misfit
     # The chi-square of 21 numbers
     assert np.mean(found) == pytest.approx(1, abs=4 * np.sqrt(2 / 21 / 40))
@@ -629,8 +624,8 @@ def test_the_noise_is_scaled_until_the_misfit_is_one(monkeypatch: pytest.MonkeyP
         return MassEstimate(SMALL.truth, np.eye(20), 5.0 / factors[-1])
 
     monkeypatch.setattr(mass_properties, "estimate_mass", fit)
-    assumed, vehicle = prior(SMALL, np.random.default_rng(3))
-    last = mass_properties.estimate_with_noise([RECORD], vehicle.lab, assumed)
+    assumed, _ = prior(SMALL, np.random.default_rng(3))
+    last = mass_properties.estimate_with_noise([RECORD], assumed)
     assert abs(np.log(last.misfit)) < 0.1
     expected = [1.0]
     while abs(np.log(5 / expected[-1])) >= 0.1:
@@ -643,7 +638,7 @@ def test_the_noise_is_scaled_until_the_misfit_is_one(monkeypatch: pytest.MonkeyP
             "estimate_mass",
             lambda records, *_, m=misfit: replace(fit(records), misfit=m),
         )
-        mass_properties.estimate_with_noise([RECORD], vehicle.lab, assumed)
+        mass_properties.estimate_with_noise([RECORD], assumed)
         np.testing.assert_allclose(factors, [1.0] + 7 * [bound], rtol=1e-9)
 
 
@@ -652,9 +647,9 @@ def test_a_misfit_falls_with_the_assumed_noise_where_attitudes_tell_little() -> 
     rng = np.random.default_rng([41, 0])
     short = mass_properties.cut(record(SMALL, rng, 26.0), slice(0, 9))
     assumed, _ = prior(SMALL, rng)
-    known = Prior(SMALL.truth, assumed.sigma)
+    known = Prior(SMALL.truth, assumed.sigma, SMALL.lab)
     misfits = [
-        mass_properties.estimate_mass([short.with_noise(factor)], SMALL.lab, known).misfit
+        mass_properties.estimate_mass([short.with_noise(factor)], known).misfit
         for factor in (1.0, 9.0, 81.0)
     ]
     # Of nearly the same residuals

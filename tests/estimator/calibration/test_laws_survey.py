@@ -271,7 +271,6 @@ def test_redundancy_is_the_share_of_residuals_that_the_unknowns_do_not_absorb(
     survey_subset.common_errors,
     Camera.with_lens,
     Camera.lens,
-    ba.free_lens,
 )
 @given(rng=SEEDS, list_m=some.floats(1e-4, 0.1), fits=some.booleans())
 def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_share(
@@ -282,7 +281,7 @@ def test_common_errors_are_the_part_of_the_inverse_matrix_that_lever_and_lens_sh
     known = replace(
         true,
         map_sigma_m=list_m,
-        free_lens=ba.free_lens(fits),
+        free_lens=7 if fits else 3,
         assumed=Assumed(true.camera_body_m, 0.005, LENS[0], 5.0),
     )
     np.testing.assert_array_equal(CAMERA.with_lens(2 * CAMERA.lens).lens, 2 * LENS)

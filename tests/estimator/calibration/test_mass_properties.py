@@ -16,7 +16,6 @@ from estimator.calibration import mass_properties
 from estimator.calibration.mass_dynamics import (
     BearingRecord,
     EquationsOfMotion,
-    LabConstants,
     MassEstimate,
     States,
 )
@@ -39,7 +38,7 @@ def flown(vehicle: Vehicle, rate_rad_s: Floats, t_s: Floats) -> tuple[States, Fl
         record(SMALL, np.random.default_rng(0), 4.0), wheel_momentum_nms=np.zeros((41, 3))
     )
     equations = EquationsOfMotion(
-        still, vehicle.lab, np.tile(vehicle.truth[:, None], len(t_s)), vehicle.truth
+        still, vehicle.known, np.tile(vehicle.truth[:, None], len(t_s))
     )
     count = len(t_s)
     momentum = np.tile((vehicle.inertia_kg_m2 @ rate_rad_s)[:, None], count)
@@ -94,17 +93,15 @@ def nees(estimate: MassEstimate, vehicle: Vehicle) -> float:
     return float(error @ np.linalg.solve(estimate.covariance[NINE, NINE], error))
 
 
-def draws(
-    count: int, seed: int
-) -> list[tuple[BearingRecord, LabConstants, float, MassEstimate]]:
+def draws(count: int, seed: int) -> list[tuple[BearingRecord, float, MassEstimate]]:
     """Records with random noise, torque and assumptions, each with the NEES of the batch estimate."""
     rows = []
     for child in np.random.SeedSequence(seed).spawn(count):
         rng = np.random.default_rng(child)
         assumed, vehicle = prior(SMALL, rng)
         one = record(vehicle, rng)
-        estimate = estimate_mass([one], vehicle.lab, assumed)
-        rows.append((one, vehicle.lab, nees(estimate, vehicle), estimate))
+        estimate = estimate_mass([one], assumed)
+        rows.append((one, nees(estimate, vehicle), estimate))
     return rows
 
 
@@ -112,7 +109,7 @@ def test_inertia_and_offset_are_found_with_errors_as_claimed() -> None:
     """Inertia to 1 % of the largest, the horizontal moment to 1e-6 kg m; squared errors as their covariance says."""
     rng = np.random.default_rng(7)
     assumed, vehicle = prior(SMALL, rng)
-    estimate = estimate_mass([record(vehicle, rng)], vehicle.lab, assumed)
+    estimate = estimate_mass([record(vehicle, rng)], assumed)
     assert nees(estimate, vehicle) < chi2.ppf(0.9999, 9)
     assert estimate.misfit == pytest.approx(1, abs=0.35)
     assert (estimate.sigma[:6] < 0.01 * np.max(INERTIA)).all()
@@ -125,7 +122,7 @@ def test_inertia_and_offset_are_found_with_errors_as_claimed() -> None:
 @pytest.mark.long
 def test_the_errors_of_a_hundred_draws_match_their_covariance() -> None:
     """The sum of 100 NEES of nine values is chi-square of 900 degrees of freedom."""
-    values = [value for _, _, value, _ in draws(100, 1)]
+    values = [value for _, value, _ in draws(100, 1)]
     assert chi2.ppf(1e-4, 900) < sum(values) < chi2.ppf(1 - 1e-4, 900)
 
 
@@ -136,8 +133,8 @@ def test_wrong_tracker_covariance_is_found_from_the_misfit(factor: float) -> Non
     assumed, vehicle = prior(SMALL, rng)
     one = record(vehicle, rng)
     wrong = replace(one, covariance_rad2=factor * one.covariance_rad2)
-    estimate = estimate_with_noise([wrong], vehicle.lab, assumed)
-    right = estimate_mass([one], vehicle.lab, assumed)
+    estimate = estimate_with_noise([wrong], assumed)
+    right = estimate_mass([one], assumed)
     assert abs(np.log(estimate.misfit)) < MISFIT_TOLERANCE
     assert nees(estimate, vehicle) < chi2.ppf(0.9999, 9)
     np.testing.assert_allclose(estimate.sigma[NINE], right.sigma[NINE], rtol=0.3)
@@ -156,8 +153,8 @@ def test_the_noise_is_found_in_two_fits(
 
     monkeypatch.setattr(mass_properties, "estimate_mass", fit)
     one: Any = SimpleNamespace(with_noise=float)
-    lab: Any = None
-    estimate_with_noise([one], lab, lab)
+    nothing: Any = None
+    estimate_with_noise([one], nothing)
     limited = float(np.clip(true_factor, 1e-3, 1e3))
     assert tried[0] == 1.0
     assert len(tried) <= (1 if true_factor == 1 else 8 if limited != true_factor else 2)
@@ -166,9 +163,9 @@ def test_the_noise_is_found_in_two_fits(
 
 @pytest.mark.slow
 def test_the_filter_ends_at_the_batch_solution() -> None:
-    for one, lab, _, batch in draws(3, 2):
+    for one, _, batch in draws(3, 2):
         rng = np.random.default_rng(5)
-        *_, last = filter_mass(one, lab, prior(SMALL, rng)[0])
+        *_, last = filter_mass(one, prior(SMALL, rng)[0])
         assert (np.abs(last.values - batch.values)[NINE] < 3 * batch.sigma[NINE]).all()
         np.testing.assert_allclose(last.sigma[NINE], batch.sigma[NINE], rtol=0.25)
 
@@ -180,7 +177,7 @@ def test_a_free_swing_determines_only_the_ratio_of_inertia_and_offset() -> None:
         SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3)
     )
     assumed, _ = prior(vehicle, rng)
-    estimate = estimate_mass([record(vehicle, rng, wheels=False)], vehicle.lab, assumed)
+    estimate = estimate_mass([record(vehicle, rng, wheels=False)], assumed)
     scale = vehicle.truth[NINE] / np.linalg.norm(vehicle.truth[NINE])
     information = np.linalg.inv(estimate.covariance[NINE, NINE])
     assumed_information = np.sum((scale / assumed.sigma[NINE]) ** 2)
@@ -204,7 +201,7 @@ def test_the_scale_of_free_swings_is_not_biased_to_small_inertias() -> None:
             SMALL, moment_kg_m=np.array([1e-5, -2e-5, -4e-4]), lab_torque_nm=np.zeros(3)
         )
         assumed, vehicle = prior(still, rng)
-        estimate = estimate_mass([record(vehicle, rng, wheels=False)], vehicle.lab, assumed)
+        estimate = estimate_mass([record(vehicle, rng, wheels=False)], assumed)
         largest = estimate.values[0] / vehicle.truth[0] - 1
         scaled.append(largest * vehicle.truth[0] / estimate.sigma[0])
         values.append(nees(estimate, vehicle))
@@ -225,8 +222,8 @@ def test_a_motion_of_known_trim_adds_the_scale() -> None:
     trimmed = replace(vehicle, moment_kg_m=vehicle.moment_kg_m + added)
     one = record(vehicle, rng, wheels=False)
     two = record(trimmed, rng, wheels=False)
-    alone = estimate_mass([one], vehicle.lab, assumed)
-    both = estimate_mass([one, replace(two, added_moment_kg_m=added)], vehicle.lab, assumed)
+    alone = estimate_mass([one], assumed)
+    both = estimate_mass([one, replace(two, added_moment_kg_m=added)], assumed)
     assert both.sigma[0] < alone.sigma[0] / 5
     assert nees(both, vehicle) < chi2.ppf(0.9999, 9)
 
@@ -246,7 +243,7 @@ def test_too_few_attitudes_and_missing_wheel_speeds_are_refused() -> None:
         replace(whole, t_s=whole.t_s[::-1])
     assumed, _ = prior(SMALL, np.random.default_rng(1))
     with pytest.raises(ImageError, match=r"11 attitudes; allowed for a filter: 24 or more$"):
-        next(filter_mass(whole, SMALL.lab, assumed))
+        next(filter_mass(whole, assumed))
     with pytest.raises(ImageError, match=r"standard deviations above 0$"):
         replace(assumed, sigma=0 * assumed.sigma)
 
@@ -283,9 +280,9 @@ def test_errors_common_to_all_attitudes_are_in_the_covariance() -> None:
             covariance_rad2=one.covariance_rad2 + shared,
             systematic_rad2=shared,
         )
-        honest += nees(estimate_with_noise([one], vehicle.lab, assumed), vehicle)
+        honest += nees(estimate_with_noise([one], assumed), vehicle)
         unshared = replace(one, covariance_rad2=one.noise_rad2, systematic_rad2=None)
-        blind += nees(estimate_with_noise([unshared], vehicle.lab, assumed), vehicle)
+        blind += nees(estimate_with_noise([unshared], assumed), vehicle)
     assert chi2.ppf(1e-4, 108) < honest < chi2.ppf(1 - 1e-4, 108)
     assert blind > chi2.ppf(1 - 1e-4, 108)
 
@@ -321,8 +318,8 @@ def test_errors_of_common_lights_and_of_the_place_are_counted_once() -> None:
             constant_rad2=constant,
             lights=lights,
         )
-        honest += nees(estimate_with_noise([one], vehicle.lab, assumed), vehicle)
+        honest += nees(estimate_with_noise([one], assumed), vehicle)
         unsplit = replace(one, constant_rad2=None, lights=None)
-        wide += nees(estimate_with_noise([unsplit], vehicle.lab, assumed), vehicle)
+        wide += nees(estimate_with_noise([unsplit], assumed), vehicle)
     assert chi2.ppf(1e-4, 108) < honest < chi2.ppf(1 - 1e-4, 108)
     assert wide < chi2.ppf(1e-4, 108)

@@ -390,7 +390,7 @@ def test_a_streak_s_center_is_between_its_ends(
     Centroids.take,
     Centroids.empty,
     pipeline.brightest,
-    pipeline.direction_sigma_rad,
+    pipeline.FrameTracker.direction_sigma_rad,
     pipeline.away_from_border,
     pipeline.inflate_uncertainty,
 )
@@ -412,7 +412,10 @@ def test_lights_are_selected_and_weighted_by_the_settings(
     few = pipeline.brightest(lights, settings)
     np.testing.assert_array_equal(few.xy_px, lights.xy_px[: 2 * base])
     assert len(lights.take(np.zeros(count, bool))) == len(Centroids.empty()) == 0
-    sigma = pipeline.direction_sigma_rad(lights, CAMERA, settings) * CAMERA.focal_px
+    tracker = pipeline.FrameTracker()
+    tracker.camera = CAMERA
+    tracker.settings = settings
+    sigma = tracker.direction_sigma_rad(lights) * CAMERA.focal_px
     assert (sigma >= np.maximum(lights.sigma_px, floor_px) - 1e-12).all()
     frame, _ = starry(rng)
     blobs = DETECTORS["local"](frame, 5.0, 3, 9, FramePriors())

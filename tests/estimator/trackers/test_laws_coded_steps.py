@@ -17,7 +17,6 @@ from estimator.identification.led_codes import LedCode
 from estimator.identification.refusals import NO_LIGHTS
 from estimator.trackers.coded_tracker import COLLECTING, CodedTracker, DecoderSettings
 from estimator.trackers.dome_tracker import MIN_ERROR_PX, SETTINGS
-from estimator.trackers.pipeline import direction_sigma_rad
 
 CAMERA = Camera(640, 480, 900.0, (319.5, 239.5))
 LEVER = Lever(np.array([0.01, 0.0, 0.3]), Rotation.identity(), 2e-4)
@@ -251,7 +250,7 @@ def test_a_tangent_errs_by_direction_map_and_lever() -> None:
     np.testing.assert_allclose(rays, CAMERA.rays(centroids.xy_px))
     offset = (centroids.xy_px - CAMERA.center_px) / 900.0
     tangent = np.hypot(*offset.T)
-    own = np.hypot(direction_sigma_rad(centroids, CAMERA, SETTINGS), MIN_ERROR_PX / 900.0)
+    own = np.hypot(eye.direction_sigma_rad(centroids), MIN_ERROR_PX / 900.0)
     angle = np.hypot(own, eye.led_sigma_rad.max())
     lever = 2e-4 / np.linalg.norm(eye.sphere.position_m, axis=1).min() * tangent
     np.testing.assert_allclose(sigma, np.hypot(angle * (1 + tangent**2), lever), rtol=1e-9)

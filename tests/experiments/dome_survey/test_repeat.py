@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from estimator.calibration.bundle_adjustment import Assumed
 from skysim.apps.cli.main import app
 from skysim.core.errors import InputError
 from skysim.experiments.dome_survey import adjust, survey_frames, survey_procedure
@@ -76,10 +77,12 @@ def test_a_survey_that_contradicts_its_assumptions_is_refused(
         lens_sigma=np.full(3, sigma_px), lever_sigma_m=np.full(3, sigma_m)
     )
     run = SimpleNamespace(survey=found, accuracy=accuracy)
+    arm_m = before.lever.camera_body_m
+    expected = Assumed(arm_m, assumed.lever_sigma_m, focal_px, assumed.focal_error * focal_px)
     if refused:
         with pytest.raises(
             InputError, match=f"survey: {parameter} .* contradicts the assumed"
         ):
-            adjust.check_plausible(run, adjust.assumed(before))  # type: ignore[arg-type]
+            adjust.check_plausible(run, expected)  # type: ignore[arg-type]
     else:
-        adjust.check_plausible(run, adjust.assumed(before))  # type: ignore[arg-type]
+        adjust.check_plausible(run, expected)  # type: ignore[arg-type]

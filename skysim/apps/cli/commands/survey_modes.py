@@ -31,7 +31,6 @@ from skysim.results.report import (
     print_blocks,
     print_table,
     print_wrapped,
-    text_column,
 )
 from skysim.scene.scene import Scene
 from skysim.simulation.lab import Lab, build_lab, build_tracker
@@ -96,7 +95,7 @@ def plan_only(request: Request) -> Record:
     heads = ("LED place mm", "lever mm", "focal length px")
     columns = [
         Column("frames"),
-        text_column("LEDs measured"),
+        "LEDs measured",
         *(Column(head, format=".3g") for head in heads),
     ]
     keys = ("led_mm", "lever_mm", "focal_px")
@@ -141,7 +140,7 @@ def repeated(request: Request, repeat: int) -> Record:
     if request.quiet:
         return result
     columns = [
-        text_column("what"),
+        "what",
         Column("predicted", format=".3g"),
         Column("simulated", format=".3g"),
         Column("ratio"),

@@ -49,7 +49,6 @@ from skysim.results.report import (
     print_blocks,
     print_table,
     print_wrapped,
-    text_column,
 )
 
 if TYPE_CHECKING:
@@ -366,7 +365,7 @@ def write_model(folder: Path | None, sheet: MeasuredFrames, fmu: bool, json: boo
         "of the model": ".3f",
     }
     columns = [Column(head, format=form) for head, form in heads.items()]
-    table = Table([text_column("fitted to"), *columns], rows)
+    table = Table(["fitted to", *columns], rows)
     p_values = [p for one in agreements for p in one.p_values]
     if len(p_values) * min(p_values) < 0.05:
         print_wrapped(
@@ -463,7 +462,7 @@ def fraction_table(fractions: dict[str, float], exclusion: ExclusionConfig) -> T
         [name, condition, f"{100 * fractions[name]:.2f} %"]
         for name, condition in conditions.items()
     ]
-    columns = [text_column(""), Column("condition"), Column("fraction of time")]
+    columns = ["", Column("condition"), Column("fraction of time")]
     return Table(columns, rows)
 
 

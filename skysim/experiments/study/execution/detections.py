@@ -73,11 +73,9 @@ def visible_rows(lab: Lab, lab_from_body: Rotation) -> list[VisibleSources]:
         near = atmosphere.air.at(lab.scene.start_time).points_seen(near)
     xy_px, distance_m, cos_out, cos_in = project_each(near, optics, poses, ends)
     rate_e_s = rates_e_s(near, optics, camera.known.emitter, distance_m, cos_out, cos_in)
-    duty = near.duty
-    electrons = rate_e_s * duty * lab.scene.exposure.time_s
-    x, y = xy_px.T
-    width_px, height_px = camera.canvas.shape[::-1]
-    visible = (x > -0.5) & (y > -0.5) & (x < width_px - 0.5) & (y < height_px - 0.5)
+    electrons = rate_e_s * near.duty * lab.scene.exposure.time_s
+    size_px = np.array(camera.canvas.shape[::-1])
+    visible = np.all((xy_px > -0.5) & (xy_px < size_px - 0.5), axis=1)
     at_rest = Trajectory.at_rest(lab.start, MARGIN_S)
     start = exposure_of(camera, at_rest, 0, Window(0.0, 0.0), None)
     obstacles = [light for light in camera.lights if isinstance(light, Obstacle)]
@@ -170,9 +168,8 @@ def solve_coded(
         lit = light_e > 0
         detections = simulate_detections(per_frame, xy_px[lit], light_e[lit], lab.scene, rng)
         window = exposure_window(lab.scene, frame)
-        middle_s = window.middle_s
         attitude = tracker.solve_centroids(
-            detections, exposure_s=window.exposure_s, t_s=middle_s, frame=frame
+            detections, exposure_s=window.exposure_s, t_s=window.middle_s, frame=frame
         )
         if attitude.solved:
             break

@@ -247,11 +247,10 @@ def light_text(scene: Scene, lab: Lab) -> str:
     """The light source in words."""
     if scene.dome:
         surface = scene.dome.surface
-        layout = scene.dome.layout
         apex_m = getattr(surface, "apex_m", None)
         height = f", {apex_m:.4g} m above the bearing" if apex_m else ""
         cap = f" within {scene.dome.points.cap_deg:g}°"
-        return f"dome ({surface.kind}{height}) with {len(lab.camera.sources)} LEDs ({layout.kind}){cap}"
+        return f"dome ({surface.kind}{height}) with {len(lab.camera.sources)} LEDs ({scene.dome.layout.kind}){cap}"
     if light := scene.stars:
         limit = f" to V = {light.limit_mag:g}" if light.limit_mag is not None else ""
         return f"{len(lab.camera.sources)} stars of {light.catalog}{limit}"

@@ -47,7 +47,6 @@ from skysim.results.report import (
     Text,
     Tone,
     Verdict,
-    text_column,
 )
 from skysim.results.requirements import NOT_MET, Judgment, percent, requirement
 
@@ -56,7 +55,7 @@ POINTS = "Points"  # titles of sections
 POOLED = "All points together"
 STUDY_FILE = "The study file"
 # Columns of the table of ranges: the least and the largest value of a response, with their points.
-RANGES = list(map(text_column, ("response", "least", "at", "largest", "at")))
+RANGES = ("response", "least", "at", "largest", "at")
 LISTED = 10  # maximum number of failures listed
 ROWS = 5000  # maximum number of rows in the table of points
 OPEN_ROWS = 20  # number of rows above which that table is folded
@@ -86,8 +85,8 @@ class Analysis(NamedTuple):
         The answer in a few sentences
     headline
         All answers in words
-    ranges
-        Range of each response, in words
+    answers
+        These, and the range of each response, in words
     indices
         Sobol indices, for the design saltelli; shares of causes where the factors switch causes on and off
     result
@@ -102,16 +101,11 @@ class Analysis(NamedTuple):
     about: Overview
     verdict: str
     headline: Sequence[str]
-    ranges: Sequence[str]
+    answers: Sequence[str]
     indices: Sequence[Index]
     result: search.SearchResult | None
     pooled: Sequence[Block]
     judged: Sequence[Sequence[Judgment]]
-
-    @property
-    def answers(self) -> list[str]:
-        """All answers."""
-        return [*self.headline, *self.ranges]
 
 
 def study_report(plan: Plan, store: Store) -> Report:
@@ -172,7 +166,7 @@ def analyze(plan: Plan, store: Store, command: Command) -> Analysis:
         about,
         answer.verdict(answered, judged, about.survey_share),
         headline,
-        answer.ranges(answered),
+        [*headline, *answer.ranges(answered)],
         indices(plan, store) if sobol or switches_causes(study) else [],
         search.collect_result(plan, store) if study.optimize else None,
         pooled_blocks(plan, columns, command("replay")) if columns else (),
@@ -346,17 +340,17 @@ def pooled_blocks(plan: Plan, columns: metrics.Columns, replay: str) -> list[Blo
         [one.value, one.event, one.point, f"`{replay} {one.trial}`"]
         for one in worst_trials(columns, response, flights=True)
     ]
-    heads = [text_column("what happened"), Column("point"), text_column("repeat it")]
+    heads = ["what happened", Column("point"), "repeat it"]
     return [
         Text(f"{row.trials} trials, one at each point; in brackets intervals of 95 %."),
-        Table([text_column("response"), Column("of all points")], spread),
+        Table(["response", Column("of all points")], spread),
         Text(
             "Dependence on the factors: an interval that excludes 0 shows one, 95 % for all together."
             if found
             else f"Dependence on the factors: too few to say, {metrics.FEWEST} trials are needed."
         ),
         Table(
-            [text_column("quantity"), text_column("factor"), Column("rank correlation")],
+            ["quantity", "factor", Column("rank correlation")],
             [[*names, with_key(one)] for *names, one in found],
         ),
         Table([Column(f"worst {ranked(response)}", format=".4g"), *heads], worst),
@@ -373,14 +367,14 @@ def requirement_table(found: Analysis) -> list[Block]:
         [f"{one.answer} ({percent(one.misses)} miss)" for one in row] for row in found.judged
     ]
     heads = ["at", *(row[0].claim for row in found.judged)]
-    return [Table(list(map(text_column, heads)), list(zip(places, *answers, strict=True)))]
+    return [Table(heads, list(zip(places, *answers, strict=True)))]
 
 
 def index_table(indices: Sequence[Index]) -> Table:
     """The Sobol indices, the largest total of each error first."""
     columns = [
-        text_column("error"),
-        text_column("factor"),
+        "error",
+        "factor",
         Column("alone, rms", "″", ".3g"),
         Column("first order"),
         Column("total"),
@@ -417,7 +411,7 @@ def from_the_last(kept: int, count: int) -> list[tuple[int]]:
 def runs_section(store: Store) -> Section:
     """The runs that have filled the store."""
     columns = [
-        text_column("engine"),
+        "engine",
         Column("workers"),
         Column("trials"),
         Column("time", "s", ".1f"),
@@ -464,9 +458,9 @@ def study_figures(lines: PointTable, columns_of: ColumnsOf, replay: str) -> list
 def worst_table(panels: Sequence[maps.DirectionMap], replay: str) -> Table:
     """The worst trials of a map's panels with the commands that repeat them."""
     columns = [
-        text_column("worst"),
+        "worst",
         Column("lights", format=".0f"),
-        text_column("what happened"),
+        "what happened",
     ]
     rows = [
         [
@@ -478,7 +472,7 @@ def worst_table(panels: Sequence[maps.DirectionMap], replay: str) -> Table:
         for panel in panels
         for one in panel.worst
     ]
-    return Table([*columns, text_column("repeat it")], rows)
+    return Table([*columns, "repeat it"], rows)
 
 
 def pivot_table(figure: Curve | Heat, lines: PointTable) -> Table:
@@ -502,7 +496,7 @@ def pivot_table(figure: Curve | Heat, lines: PointTable) -> Table:
         for one in levels
     ]
     heads = [Column(across.tick_label(x)) for x in across.levels]
-    return Table([text_column(f"{figure.response}: {across.label}"), *heads], rows)
+    return Table([f"{figure.response}: {across.label}", *heads], rows)
 
 
 def search_figures(
