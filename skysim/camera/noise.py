@@ -179,11 +179,11 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
     found = memory.found
     width = row.size
     bits = memory.bits[: (row.size + 3) // 4]
-    # 1. Large means alone. A sum, since compilers do not make vector instructions of a minimum of floats.
-    small = 0
-    for x in range(width):
-        small += row[x] < float32(INVERSION_MAX_E)
-    if small == 0:
+    # 1. Large means alone. In most rows the first pixel is not large, which ends the search.
+    large = 0
+    while large < width and row[large] >= float32(INVERSION_MAX_E):
+        large += 1
+    if large == width:
         for x in range(width):
             late[x] = x
         return _count_large(row, late[:width], state, memory)

@@ -111,12 +111,14 @@ def render(
     all_poses = poses(trajectory, mount, t_s)
     # 1. Coarse selection with a few poses, before the sources are projected at all of them.
     # It knows no motion of sources, so moving sources are all kept.
-    candidates = sources
     if sources.motion is None:
         few_poses = taken(all_poses, slice(None, None, len(t_s) // 8))
-        candidates = sources.take(in_view(sources, optics, few_poses))
+        rows = in_view(sources, optics, few_poses)
+    else:
+        rows = np.arange(len(sources))
     if occluded:
-        candidates = candidates.take(~occluded(candidates.place))
+        rows = rows[~occluded(sources.place[rows])]
+    candidates = sources.take(rows)
     # 2. Project them at all poses; the pose in the middle gives the frame's truth.
     emitter = emitter or Emitter()
     middle = len(t_s) // 2
@@ -138,42 +140,39 @@ def render(
 
 def truth_on_chip(ids: Ints, tracks: Tracks, table: Floats, window: Window) -> SourceTruth:
     """The truth of the sources that gave light to the chip, from the table of `draw`."""
-    mid_px = tracks.xy_px[len(tracks.xy_px) // 2]
-    on_chip = table[:, 0] > 0
-    electrons, peak, x, y, squares, length = table[on_chip, :6].T
+    on_chip = np.flatnonzero(table[:, 0] > 0)
+    shown = table[on_chip]
+    electrons, peak, _, _, squares, length = shown[:, :6].T.copy()
     return SourceTruth(
         id=ids[on_chip],
-        xy_px=mid_px[on_chip],
-        flux_xy_px=np.column_stack([x, y]),
+        xy_px=tracks.xy_px[len(tracks.xy_px) // 2, on_chip],
+        flux_xy_px=shown[:, 2:4].copy(),
         electrons=electrons,
         peak_e=peak,
         streak_px=length,
         # Noise-equivalent area (sum I)^2 / sum I^2.
         area_px=electrons**2 / squares,
-        peak_xy=table[on_chip, 6:8].astype(np.int64),
+        peak_xy=shown[:, 6:8].astype(np.int64),
         saturated=np.zeros(len(electrons), bool),  # set by the detector, as is the SNR
         snr=np.full(len(electrons), np.nan),
-        streak_xy_px=streak_vectors_px(tracks, mid_px, window)[on_chip],
+        streak_xy_px=_streaks_px(tracks, on_chip, window),
     )
 
 
-def streak_vectors_px(tracks: Tracks, mid_px: Floats, window: Window) -> Floats:
-    """(N, 2) displacement of each image over the exposure of the row that it is on at mid-exposure."""
-    # A row's exposure begins row_time_s after that of the row above it.
-    row = np.clip(np.nan_to_num(mid_px[:, 1]), 0, window.rows - 1)
-    begin_s = window.open_s + window.row_time_s * row
-    return _displacement(tracks, begin_s, begin_s + window.exposure_s)
-
-
 @jit
-def _displacement(tracks: Tracks, begin_s: Floats, end_s: Floats) -> Floats:
-    """(N, 2) difference of the images' positions between two times (N,)."""
-    out = np.empty((len(begin_s), 2))
-    for n in range(len(begin_s)):
-        x0, y0, _ = _interpolate(tracks, n, begin_s[n])
-        x1, y1, _ = _interpolate(tracks, n, end_s[n])
-        out[n, 0] = x1 - x0
-        out[n, 1] = y1 - y0
+def _streaks_px(tracks: Tracks, which: Ints, window: Window) -> Floats:
+    """(M, 2) displacement of some images over the exposure of the row that each is on at mid-exposure."""
+    out = np.empty((len(which), 2))
+    for m in range(len(which)):
+        n = which[m]
+        # A row's exposure begins row_time_s after that of the row above it.
+        y = tracks.xy_px[tracks.xy_px.shape[0] // 2, n, 1]
+        row = min(max(y, 0.0), window.rows - 1.0) if np.isfinite(y) else 0.0
+        begin_s = window.open_s + window.row_time_s * row
+        x0, y0, _ = _interpolate(tracks, n, begin_s)
+        x1, y1, _ = _interpolate(tracks, n, begin_s + window.exposure_s)
+        out[m, 0] = x1 - x0
+        out[m, 1] = y1 - y0
     return out
 
 
@@ -230,21 +229,31 @@ def draw(
     return out
 
 
-def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, ...]) -> Ints:
+@jit
+def patches(xy_px: Floats, reach_px: Floats, shape: tuple[int, int]) -> Ints:
     """(N, 4) first column, last + 1, first row, last + 1 that each image can reach; empty where it misses the chip."""
-    if not xy_px.shape[1]:
-        return np.zeros((0, 4), np.int64)
-    # Extent of the path; NaN positions do not count.
-    hidden = np.isnan(xy_px)
-    low = np.where(hidden, np.inf, xy_px).min(axis=0)
-    high = np.where(hidden, -np.inf, xy_px).max(axis=0)
-    jump = np.nan_to_num(np.abs(np.diff(xy_px, axis=0))).max(axis=0)
-    # A curved path leaves the chord between two samples; a quarter of the longest one covers it.
-    margin = reach_px[:, None] + 1 + jump / 4
-    limit = np.array(shape[1::-1])
-    begin = np.clip(np.floor(low - margin), 0, limit)
-    end = np.clip(np.ceil(high + margin) + 1, begin, limit)
-    return np.column_stack([begin[:, 0], end[:, 0], begin[:, 1], end[:, 1]]).astype(np.int64)
+    poses, count, _ = xy_px.shape
+    out = np.zeros((count, 4), np.int64)
+    for n in range(count):
+        for axis in range(2):
+            # Extent of the path, and the longest chord between two samples; a NaN leaves them unchanged.
+            low = np.inf
+            high = -np.inf
+            jump = 0.0
+            before = np.nan
+            for k in range(poses):
+                x = xy_px[k, n, axis]
+                low = min(low, x)
+                high = max(high, x)
+                jump = max(jump, abs(x - before))
+                before = x
+            # A curved path leaves the chord; a quarter of it covers that.
+            margin = reach_px[n] + 1 + jump / 4
+            limit = shape[1 - axis]
+            begin = min(max(np.floor(low - margin), 0.0), limit)
+            out[n, 2 * axis] = begin
+            out[n, 2 * axis + 1] = min(max(np.ceil(high + margin) + 1, begin), limit)
+    return out
 
 
 @jit(parallel=True)

@@ -148,34 +148,43 @@ def matrix_vector(matrix: Floats, v: Floats) -> Floats:
 
 @jit
 def interpolate(
-    knots_wxyz: Floats, hermite_rad: Floats, knot: NDArray[np.int64], fraction: Floats
+    t_s: Floats,
+    knots_s: Floats,
+    knots_wxyz: Floats,
+    rotvec_rad: Floats,
+    rates_rad_s: Floats,
 ) -> Floats:
-    """(M, 4) attitudes between knots (N, 4): cubic Hermite in the rotation vector from the previous knot.
+    """(M, 4) attitudes at times (M,) between N knots: cubic Hermite in the rotation vector from the previous knot.
 
-    With the elapsed fraction s of the step, the rotation vector r to the next knot and its derivatives r0', r1':
+    With the elapsed fraction s of a step h, the rotation vector r to the next knot and its derivatives r0', r1':
 
-        r(s) = s^2 (3 - 2 s) r + s (1 - s)^2 r0' - s^2 (1 - s) r1'
+        r(s) = s^2 (3 - 2 s) r + s (1 - s)^2 h r0' - s^2 (1 - s) h r1',    r0' = w0, r1' = w1 + r x w1 / 2 + ...
 
     Parameters
     ----------
-    knots_wxyz
-        (N, 4) attitudes at the knots
-    hermite_rad
-        (N - 1, 3, 3) rotation vector to the next knot, and its derivatives at both ends times the step
-    knot, fraction
-        (M,) index of the knot before each time, and elapsed fraction of the step
+    knots_s, knots_wxyz
+        (N,) times and (N, 4) attitudes of the knots
+    rotvec_rad
+        (N - 1, 3) rotation vectors to the next knot
+    rates_rad_s
+        (N, 3) rates w at the knots, in their own axes
     """
-    out = np.empty((len(knot), 4))
-    for m in range(len(knot)):
-        k = knot[m]
-        s = fraction[m]
+    out = np.empty((len(t_s), 4))
+    for m in range(len(t_s)):
+        after = np.searchsorted(knots_s, t_s[m], side="right")
+        k = min(max(after - 1, 0), len(knots_s) - 2)
+        step_s = knots_s[k + 1] - knots_s[k]
+        s = (t_s[m] - knots_s[k]) / step_s
         # Hermite basis: value at the end, slopes at the beginning and the end. The value at the beginning is zero.
         a = s * s * (3 - 2 * s)
         b = s * (1 - s) ** 2
         c = -s * s * (1 - s)
-        rotvec, begin, end = hermite_rad[k]
-        turned = multiply(knots_wxyz[k], from_rotvec(a * rotvec + b * begin + c * end))
+        rotvec = rotvec_rad[k]
+        end = rates_rad_s[k + 1] * step_s
+        end = end + cross(rotvec, end) / 2
+        vector = a * rotvec + b * (rates_rad_s[k] * step_s) + c * end
+        attitude = multiply(knots_wxyz[k], from_rotvec(vector))
         # An assignment to the row would take longer to compile than the rest of the function.
         for n in range(4):
-            out[m, n] = turned[n]
+            out[m, n] = attitude[n]
     return out

@@ -77,6 +77,8 @@ def frozen(kind: type[Kind]) -> type[Kind]:
 
 def joined(parts: Sequence[Kind]) -> Kind:
     """Objects of one class, whose fields are columns of equal length, as one: the rows of all, in their order."""
+    if len(parts) == 1:
+        return parts[0]
     kind: Any = type(parts[0])
     names = getattr(kind, "_fields", kind.__slots__)
     columns = ([getattr(part, name) for part in parts] for name in names)
@@ -169,15 +171,11 @@ class Trajectory:
         )
 
     @cached_property
-    def hermite_segments(self) -> tuple[Floats, Floats]:
-        """Attitudes (N, 4) as wxyz and hermite_rad (N - 1, 3, 3) for `quaternion.interpolate`; computed once."""
-        step = np.diff(self.t_s)[:, None]
+    def knots(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """What `quaternion.interpolate` takes, computed once; contiguous, so that it is compiled for one layout."""
         rotvec = (self.lab_from_body[:-1].inv() * self.lab_from_body[1:]).as_rotvec()
-        begin = self.rate_body_rad_s[:-1] * step
-        end = self.rate_body_rad_s[1:] * step
-        # d(rotvec)/dt = omega + rotvec x omega / 2 + ...: the rotation vector is from the previous sample.
-        end = end + np.cross(rotvec, end) / 2
-        return from_rotation(self.lab_from_body), np.stack([rotvec, begin, end], axis=1)
+        t_s, rates_rad_s = map(np.ascontiguousarray, (self.t_s, self.rate_body_rad_s))
+        return t_s, from_rotation(self.lab_from_body), rotvec, rates_rad_s
 
     def attitude_at(self, t_s: float | Floats) -> Rotation:
         """lab_from_body at any time within the history. Raises ValueError outside of it.
@@ -185,16 +183,12 @@ class Trajectory:
         The interpolation is cubic Hermite in the rotation vector from the previous sample, with the rates at both ends.
         Its error is of fourth order in the step.
         """
-        t = np.atleast_1d(np.asarray(t_s, dtype=float))
+        t = np.array(t_s, float, ndmin=1)
         if t.min() < self.t_s[0] - 1e-9 or t.max() > self.t_s[-1] + 1e-9:
             raise ValueError(
                 f"time {t.min():.6f}..{t.max():.6f} s is outside {self.t_s[0]}..{self.t_s[-1]} s"
             )
-        k = np.minimum(
-            np.maximum(np.searchsorted(self.t_s, t, side="right") - 1, 0), len(self.t_s) - 2
-        )
-        fraction = (t - self.t_s[k]) / (self.t_s[k + 1] - self.t_s[k])
-        wxyz = interpolate(*self.hermite_segments, k, fraction)
+        wxyz = interpolate(t, *self.knots)
         return to_rotation(wxyz if np.ndim(t_s) else wxyz[0])
 
     def means(self, t_s: Floats) -> tuple[Rotation, Floats]:

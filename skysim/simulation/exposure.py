@@ -5,8 +5,8 @@
 3. Draw points and discs along each path through the lens (camera/render.py, camera/discs), then the lens's glare.
    A color camera draws 2. and 3. once for the pixels of each color.
 4. Add the charge smear of the shutter, and let charge repel charge (camera/detector).
-5. Convert the light to digital numbers: noise, charge, analog-to-digital conversion (camera/detector).
-6. Collect the truth of the frame.
+5. Collect the truth of the frame.
+6. Convert the light to digital numbers: noise, charge, analog-to-digital conversion (camera/detector).
 """
 
 import math
@@ -99,8 +99,10 @@ def render_frame(
     repel(light_e, detector.config)
     # Saturation and SNR need the light of the whole frame, which `expose` then overwrites.
     sources = add_snr_and_saturation(sources, light_e, window.exposure_s, detector)
+    # 5. Truth. Before the detector, whose passes over the whole frame would empty the processor's cache.
+    truth = truth_of(beam, exposure, sources)
     clock.lap("render")
-    # 5. Detector.
+    # 6. Detector, and the camera's time tag.
     image = expose(
         light_e,
         window.exposure_s,
@@ -109,12 +111,11 @@ def render_frame(
         added,
     )
     clock.lap("detector")
-    # 6. Frame with the camera's time tag, and truth.
     tagged_s = exposure.t_s + time_tag_error_s(scene, index)
     frame = Frame(
         index, image, tagged_s, window.exposure_s, saturation_dn(scene.camera.detector)
     )
-    return frame, truth_of(beam, exposure, sources)
+    return frame, truth
 
 
 def render_at_rest(
@@ -273,9 +274,10 @@ def truth_of(beam: Beam, exposure: Exposure, sources: SourceTruth) -> Truth:
     for lit in beam.lits:
         if lit.points is not None and lit.occlusion is not None:
             near = in_view(lit.points, exposure.optics, exposure.pose, reach=0.0)
-            behind = lit.points.take(near[lit.occlusion(lit.points.place[near])])
+            near = near[lit.occlusion(lit.points.place[near])]
             # Most exposures have none.
-            if len(behind):
+            if len(near):
+                behind = lit.points.take(near)
                 hidden.append(behind.id[on_detector(behind, exposure)[0]])
     return Truth(
         exposure.t_s,

@@ -708,6 +708,18 @@ def test_a_patch_holds_the_bend_of_a_path_between_two_samples() -> None:
     assert x1 - x0 < 2 * (100 + 3) + 2 * 77 / 4 + 4
 
 
+def test_positions_without_an_image_do_not_widen_a_patch() -> None:
+    """The first source loses its image during the exposure, the second has none, the third is beside the chip."""
+    xy = np.full((9, 3, 2), np.nan)
+    xy[:4, 0] = [[20, 30], [21, 30], [23, 30], [24, 30]]
+    xy[:, 2] = [150.0, 40.0]
+    first, second, third = rendering.patches(xy, np.full(3, 3.0), (100, 120))
+    # The reach, a pixel, and a quarter of the longest chord on either side; up to the next whole pixels.
+    assert first.tolist() == [20 - 5, 24 + 5 + 1, 30 - 4, 30 + 4 + 1]
+    for x0, x1, y0, y1 in (second, third):
+        assert (x1 - x0) * (y1 - y0) == 0
+
+
 def test_a_cubic_path_is_followed_exactly_from_its_first_sample_to_its_last() -> None:
     """A cubic through four samples is the path itself if that is cubic, in the first and last interval too."""
 

@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from skysim.core import quaternion
+from skysim.core.types import Trajectory
 
 TURNS = [[0.3, -1.2, 2.0], [1e-12, 0, 0], [0, 0, 0], [0, np.pi - 1e-9, 0], [-2.0, 1.0, 1.5]]
 
@@ -63,3 +64,19 @@ def test_the_cross_product_matches_numpy() -> None:
     a = np.array([1.0, -2.0, 0.5])
     b = np.array([0.3, 4.0, -7.0])
     np.testing.assert_array_equal(quaternion.cross(a, b), np.cross(a, b))
+
+
+def test_a_motion_of_any_memory_layout_is_interpolated_by_the_same_compiled_code() -> None:
+    """Telemetry comes as columns of a table. Compilation for each layout would take a second in a flight."""
+    rate = np.array([0.1, -0.2, 0.3])
+    t_s = np.linspace(0.0, 2.0, 9)
+    made = Trajectory.at_rate(Rotation.identity(), rate, 0.0, t_s)
+    table = np.asfortranarray(np.column_stack([t_s, t_s, made.rate_body_rad_s]))
+    strided = Trajectory(table[::2, 0], made.lab_from_body[::2], table[::2, 2:])
+    times_s = np.array([0.0, 0.33, 1.999, 2.0, 0.5])
+    made.attitude_at(times_s)
+    compiled = len(quaternion.interpolate.signatures)
+    for motion in (made, strided):
+        expected = Rotation.from_rotvec(np.outer(times_s[::-1], rate))
+        assert (motion.attitude_at(times_s[::-1]).inv() * expected).magnitude().max() < 1e-14
+    assert len(quaternion.interpolate.signatures) == compiled

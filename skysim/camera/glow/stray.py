@@ -48,7 +48,7 @@ def ghost_optics(optics: Optics, ghost: GhostConfig) -> Optics:
 
 def as_ghosts(lights: SourceTruth, number: int) -> SourceTruth:
     """The truth of lights that were drawn through a pair of surfaces, numbered as its ghosts; pairs count from 1."""
-    return replace(lights, id=lights.id + number * GHOST)
+    return replace(lights, id=lights.id + number * GHOST) if number else lights
 
 
 # Veiling glare.

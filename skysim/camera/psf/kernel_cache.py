@@ -155,9 +155,9 @@ def source_kernels(
     # Defocus depends on the distance along the boresight.
     axial_m = np.where(is_led, distance_m * np.maximum(cos_field, 1e-6), np.inf)
     defocus = blur_radius_px(camera, axial_m, chromatic[:, 0])
-    outside_px = np.maximum(np.maximum(-position, position - camera.size_px), 0).max(axis=1)
     # Sources far outside the frame have no image.
-    near = (outside_px < MAX_RADIUS_PX)[:, None]
+    outside_px = np.maximum(-position, position - camera.size_px)
+    near = np.maximum(*outside_px.T)[:, None] < MAX_RADIUS_PX
     radii_px = np.where(near, np.column_stack([emitter, defocus]), 0.0)
     axes_px = radii_px[:, [0, 0]] if disks is None else disks.semi_axes_px()
     check_radii(radii_px, axes_px)
@@ -170,7 +170,7 @@ def source_kernels(
         camera.detector.intrapixel or coma_px.any()
     )
     if gaussian:
-        keys[(keys[:, 1:] == 0).all(axis=1), 0] = 0
+        keys[keys[:, 1] + keys[:, 2] == 0, 0] = 0
     if coma_px.any():
         coma_px[disk.any(axis=1)] = 0
         keys = np.column_stack([keys, np.rint(coma_px / COMA_PX).astype(np.int64)])
