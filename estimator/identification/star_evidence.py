@@ -162,7 +162,8 @@ def evaluate(
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
         # 3. Reject most false candidates early, with the information of the first fit: exact matches, no missing star.
-        if n == 1 and min_dex > -np.inf:
+        # One that most detections match is hardly false.
+        if n == 1 and min_dex > -np.inf and 2 * len(observed) < len(gates):
             dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, n > 1)
             if dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
