@@ -25,6 +25,11 @@ def rss_mb() -> float:
     return int(next(line for line in lines if line.startswith("VmRSS")).split()[1]) / 1024
 
 
+def megabytes(index: tuple[Any, ...]) -> float:
+    """Memory of an index's arrays, MB."""
+    return sum(array.nbytes for array in index if isinstance(array, np.ndarray)) / 1e6
+
+
 def milliseconds(call: Callable[[], object]) -> tuple[float, float]:
     """Median and 99th percentile of a call's duration."""
     taken = []
@@ -48,10 +53,8 @@ def measure() -> list[dict[str, Any]]:
         figure("tracker built in", built_s, "s", stars),
         figure("tracker built", rss_mb(), "MB", stars),
         figure("index of pairs", pairs_mb, "MB", stars),
-        figure(
-            "index of quads", sum(array.nbytes for array in tracker.quads) / 1e6, "MB", stars
-        ),
-        figure("index of stars", tracker.sky.bytes / 1e6 - pairs_mb, "MB", stars),
+        figure("index of quads", megabytes(tracker.quads), "MB", stars),
+        figure("index of stars", megabytes(tracker.sky) - pairs_mb, "MB", stars),
     ]
     follower = TrackingMode(tracker)
     begin = time.perf_counter()

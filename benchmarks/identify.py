@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,11 +29,28 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.paths import CATALOGS
 
 FIELDS = 100
-NARROW_FIELDS = 40
+NARROW_FIELDS = 200
+COMMAND_FIELDS = 18
 NARROW_DEG = 2.6
 NARROW_PX = 1024
 FALSE_SHARES = 0.0, 0.3
 WRONG_RAD = np.radians(1 / 6)
+# A command of skysim, and then its greatest resident and its private memory, MB, and its CPU time, s. The kernel's
+# figure for a child process would include the memory of this one.
+MEASURED = """
+import runpy, sys, time
+try:
+    runpy.run_module("skysim", run_name="__main__", alter_sys=True)
+except SystemExit as end:
+    if end.code:
+        raise
+kilobytes = {}
+for name in ("status", "smaps_rollup"):
+    for line in open(f"/proc/self/{name}"):
+        key, *words = line.split()
+        kilobytes[key] = words[0] if words else ""
+print(*(1024 * int(kilobytes[key]) / 1e6 for key in ("VmHWM:", "Anonymous:")), time.process_time())
+"""
 
 
 def measure() -> list[dict[str, Any]]:
@@ -73,7 +93,35 @@ def narrow() -> list[dict[str, Any]]:
         tracker.warm_up()
         for share in FALSE_SHARES:
             rows += narrow_times(tracker, share)
+        rows += narrow_command(tracker, Path(folder))
     return rows
+
+
+def narrow_command(tracker: StarTracker, folder: Path) -> list[dict[str, Any]]:
+    """Memory and CPU time of `skysim solve` for lists of lights of narrow fields, its index on disk."""
+    lists = []
+    for n in range(COMMAND_FIELDS):
+        rng = np.random.default_rng([4, n])
+        seen = crowded(tracker, Rotation.random(rng=rng), 0.0, rng)
+        table = np.column_stack([seen.xy_px, seen.flux])
+        lists.append(str(folder / f"{n}.csv"))
+        np.savetxt(lists[-1], table, delimiter=",", header="x_px,y_px,flux", comments="")
+    options = ["--fov", str(NARROW_DEG), "--size", f"{NARROW_PX}x{NARROW_PX}"]
+    options += ["--catalog", str(deep_catalog().resolve()), "--out", str(folder / "solved")]
+    used = []
+    for few in (1, 1, COMMAND_FIELDS):  # the first one builds the index
+        command = [sys.executable, "-c", MEASURED, "solve", *options, *lists[:few]]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        used.append([float(word) for word in done.stdout.splitlines()[-1].split()])
+    a_frame_s = (used[2][2] - used[1][2]) / (COMMAND_FIELDS - 1)
+    what = f"{COMMAND_FIELDS} lists of lights"
+    name = "2.6 deg to V 10, skysim solve"
+    return [
+        verdict(f"{name}: greatest memory", used[2][0], "MB", what, 400),
+        figure(f"{name}: private memory at the end", used[2][1], "MB", what),
+        figure(f"{name}: greatest memory, index built", used[0][0], "MB", "1 list"),
+        verdict(f"{name}: CPU of a frame", a_frame_s, "s", what, 0.3),
+    ]
 
 
 def narrow_times(tracker: StarTracker, false_share: float) -> list[dict[str, Any]]:

@@ -28,6 +28,7 @@ FORM = b"quads 1"
 FEW_STARS = 50_000
 MOST_FILES = 8
 HEAD = SIDE**4 + 1  # words of `first`
+WHOLE_CRC = 0x2144DF1C  # CRC-32 of any bytes followed by their CRC-32, the low byte first
 
 
 def folder() -> Path:
@@ -47,9 +48,12 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
     built = quad_index.build(sky, height_rad)
     with suppress(OSError, ValueError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        data = b"".join(array.tobytes() for array in (built.first, built.star, built.code))
+        crc = 0
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as file:
-            file.write(data + np.uint32(zlib.crc32(data)).tobytes())
+            for array in (built.first, built.star, built.code):
+                crc = zlib.crc32(array.data, crc)
+                file.write(array.data)
+            file.write(crc.to_bytes(4, "little"))
         os.replace(file.name, path)
         # The oldest files are removed.
         files = sorted(path.parent.glob("quads_*.bin"), key=os.path.getmtime)
@@ -61,9 +65,14 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
 
 def read(path: Path) -> QuadIndex:
     """Map a file into memory. Raises OSError or ValueError if there is none, or if it is damaged."""
-    # Copy on write: compiled code has one version, for arrays that can be written.
-    words = np.asarray(np.memmap(path, np.int32, "c"))
-    if len(words) <= HEAD or zlib.crc32(words[:-1].data) != words[-1].view(np.uint32):
+    crc = 0
+    with path.open("rb") as file:
+        # Read, not mapped: pages of the map count as memory of the process once they are touched.
+        while part := file.read(2**20):
+            crc = zlib.crc32(part, crc)
+        # Copy on write: compiled code has one version, for arrays that can be written.
+        words = np.asarray(np.memmap(file, np.int32, "c"))
+    if len(words) <= HEAD or crc != WHOLE_CRC:
         raise ValueError(f"{path}: damaged")
     star, code = words[HEAD:-1].reshape(2, -1, 4)
     return QuadIndex(star, code.view(np.float32), words[:HEAD])

@@ -192,6 +192,7 @@ def nearest(
 # Sky index: star pairs binned by separation, and stars by direction.
 PAIRS_PER_BIN = 8
 MOST_PAIRS = 2e6  # of a uniform sky: fewer stars are paired for more
+PART = 2**16  # pairs whose angles are computed at once
 MAG_STEP = 0.1
 MAG_SMOOTHING = (
     0.25  # standard deviation of the Gaussian that smooths the histogram of magnitudes
@@ -228,11 +229,6 @@ class SkyIndex(NamedTuple):
     cell_first: Ints32
     cell_star: Ints32
     side: int
-
-    @property
-    def bytes(self) -> int:
-        """Memory of the arrays, bytes."""
-        return sum(array.nbytes for array in self if isinstance(array, np.ndarray))
 
 
 def build(
@@ -276,11 +272,15 @@ def build(
 
 def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[Ints32, Floats]:
     """The (P, 2) rows of all pairs of (N, 3) unit vectors up to an angle, and their (P,) angles."""
-    chord = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
-    pair = cKDTree(vectors).query_pairs(chord, output_type="ndarray").astype(np.int32)
-    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits.
-    half_chord = lengths(vectors[pair[:, 0]] - vectors[pair[:, 1]]) / 2
-    return pair, 2 * np.arcsin(np.minimum(half_chord, 1.0))
+    longest = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
+    pair = cKDTree(vectors).query_pairs(longest, output_type="ndarray").astype(np.int32)
+    # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits. Part by part, as
+    # the vectors of all pairs would take six times the memory of the pairs.
+    chord = [
+        lengths(vectors[part[:, 0]] - vectors[part[:, 1]])
+        for part in np.array_split(pair, 1 + len(pair) // PART)
+    ]
+    return pair, 2 * np.arcsin(np.minimum(np.concatenate(chord) / 2, 1.0))
 
 
 def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:

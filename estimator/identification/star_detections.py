@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimator.catalog.sky_index import cell_of
 from estimator.core import vectors
 from estimator.core.camera import Distortion, undistorted
-from estimator.core.checks import Floats
+from estimator.core.checks import Floats, Ints
 from estimator.core.jit import jit
 from estimator.core.types import NO_SPREAD, Centroids
 from estimator.identification.chance import GATE_SIGMA, middle, squared_separation
@@ -151,21 +151,19 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
         rows = spread(centroids.xy_px, field, most)
         centroids = centroids.take(rows)
     # 2. Double images
-    head = brighter_within(centroids.xy_px, DOUBLE_PX)
-    members = np.bincount(head)
-    pairs = np.count_nonzero(members == 2)
+    head, are_pairs = brighter_within(centroids.xy_px, DOUBLE_PX)
     by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
-    if 2 * pairs < np.count_nonzero(members) or by_chance > 1 / 8:
+    if not are_pairs or by_chance > 1 / 8:
         return ChosenLights(centroids, rows, np.zeros(2))
-    first, group = np.unique(head, return_inverse=True)
+    first, group, members = np.unique(head, return_inverse=True, return_counts=True)
     sums_px = [np.bincount(group, x) for x in centroids.xy_px.T]
-    mean_px = np.stack(sums_px, axis=1) / members[first, None]
+    mean_px = np.stack(sums_px, axis=1) / members[:, None]
     offset_px = centroids.xy_px - mean_px[group]
     second = np.flatnonzero(head < np.arange(len(head)))
-    reach2_px2 = np.zeros(len(first))
-    np.maximum.at(reach2_px2, group, np.sum(offset_px**2, axis=1))
+    distance2_px2 = np.sum(offset_px**2, axis=1)
     # A light without a second image may be either of its images, too.
-    reach2_px2 = np.maximum(reach2_px2, np.median(np.sum(offset_px[second] ** 2, axis=1)))
+    reach2_px2 = np.full(len(first), np.median(distance2_px2[second]))
+    np.maximum.at(reach2_px2, group, distance2_px2)
     merged = centroids.take(first)
     spread_px2 = merged.covariance_px2
     if spread_px2 is not None:
@@ -186,9 +184,13 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
 
 
 @jit
-def brighter_within(xy_px: Floats, reach_px: float) -> NDArray[np.int64]:
-    """(N,) row of the brightest light within reach that is not itself near a brighter one, or else the own row."""
+def brighter_within(xy_px: Floats, reach_px: float) -> tuple[Ints, bool]:
+    """Groups of near lights: (N,) row of the brightest of each light's group; whether at least half of them are pairs.
+
+    The brightest is the first light within reach that is not itself near a brighter one, or else the light itself.
+    """
     head = np.arange(len(xy_px))
+    members = np.zeros(len(xy_px), np.int64)
     for n in range(len(xy_px)):
         for m in range(n):
             dx = xy_px[n, 0] - xy_px[m, 0]
@@ -196,7 +198,8 @@ def brighter_within(xy_px: Floats, reach_px: float) -> NDArray[np.int64]:
             if head[m] == m and dx * dx + dy * dy < reach_px * reach_px:
                 head[n] = m
                 break
-    return head
+        members[head[n]] += 1
+    return head, 2 * np.sum(members == 2) >= np.sum(members > 0)
 
 
 @jit

@@ -19,7 +19,7 @@ The steps of `evaluate`; the same numbers return as comments in the code:
 
 1. Match each detection to its nearest star (`_match`).
 2. Fit attitude and focal ratio to the matches by one Gauss-Newton step (`_fit`).
-3. Match again, with the gates of the detections alone, and reject a candidate of too little evidence without residuals.
+3. Match again, with the gates of the detections alone; reject few matches of too little evidence without residuals.
 4. Fit and match once more, unless the fit has converged.
 5. Compute the evidence (`_evidence`), and count the missing stars (`_count_missing`).
 """
@@ -161,8 +161,8 @@ def evaluate(
         max_sigma = GATE_SIGMA
         if len(observed) < MIN_EVIDENCE_MATCHES:
             return no_hypothesis()
-        # 3. Reject most false candidates early, with the information of the first fit: exact matches, no missing star.
-        if n == 1 and min_dex > -np.inf:
+        # 3. Unless most detections match, reject early, with the information of the first fit: exact, no missing star.
+        if n == 1 and min_dex > -np.inf and 2 * len(observed) < len(gates):
             dex = _evidence(detections, sky, R, focal_ratio, observed, star, info, n > 1)
             if dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()

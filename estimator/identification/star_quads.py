@@ -1,8 +1,9 @@
-"""Lost-in-space star identification by quads of detections: for a camera whose focal length is uncertain.
+"""Lost-in-space star identification by quads: for an uncertain focal length, and for a deep sky in a narrow field.
 
 The code of four detections (`catalog.quad_index`) hardly depends on the focal length. Only the few catalog quads of the
-same code are therefore candidates, however uncertain the focal length is. The two detections farthest apart and their
-stars determine the attitude and the focal length, which the other detections confirm as in `star_search`.
+same code are therefore candidates, however uncertain the focal length is, and however many stars there are: an index
+of quads has the stars that are bright for their surroundings. The two detections farthest apart and their stars
+determine the attitude and the focal length, which the other detections confirm as in `star_search`.
 
 The steps; the same numbers return as comments in the code:
 
@@ -113,9 +114,8 @@ def _test_quad(
     """
     # 2. The code: C and D in the axes of A and B.
     _longest_first(detections.tangent, quad)
-    a, b = quad[0], quad[1]
-    ray_a = ray(detections.tangent, a, 1.0)
-    ray_b = ray(detections.tangent, b, 1.0)
+    ray_a = ray(detections.tangent, quad[0], 1.0)
+    ray_b = ray(detections.tangent, quad[1], 1.0)
     length = vectors.chord(ray_a, ray_b)
     code = np.empty(4)
     frame = np.empty((3, 3))
@@ -123,7 +123,6 @@ def _test_quad(
     code[:2] = quad_index.in_frame(frame, ray(detections.tangent, quad[2], 1.0), length)
     code[2:] = quad_index.in_frame(frame, ray(detections.tangent, quad[3], 1.0), length)
     quad_index.arrange(code, quad)
-    a, b = quad[0], quad[1]
     # 3. All cells within the gate of the code.
     gate = _code_gate(detections, quad, length)
     low = np.empty(4, np.int64)
@@ -143,8 +142,9 @@ def _test_quad(
                     # 4. and 5. Test the attitude of this quad.
                     checks[0] += star_search.EVALUATION_COST
                     stars = quads.star[q]
+                    match = (quad[0], quad[1], stars[0], stars[1])
                     candidate = star_search.pair_hypothesis(
-                        detections, sky, (a, b, stars[0], stars[1]), star_search.DECISIVE_DEX
+                        detections, sky, match, star_search.DECISIVE_DEX
                     )
                     if candidate.dex >= star_search.DECISIVE_DEX:
                         return candidate
@@ -177,8 +177,6 @@ def _longest_first(tangent: Floats, quad: Ints) -> None:
                 first = k
                 second = m
     quad[0], quad[first] = quad[first], quad[0]
-    # If the first swap moved the second detection, it is now where `first` was.
-    second = first if second == 0 else second
     quad[1], quad[second] = quad[second], quad[1]
 
 

@@ -41,6 +41,7 @@ from estimator.identification.chance import (
     ACCEPT_DEX,
     GATE_SIGMA,
     separation,
+    squared_separation,
 )
 from estimator.identification.star_detections import (
     Detections,
@@ -135,7 +136,7 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     Hypothesis
         The first one with DECISIVE_DEX, or else the best if it passes ACCEPT_DEX and MARGIN_DEX, or else the empty one
     """
-    cost, hubs = _pair_costs(detections)
+    crowd, hubs = _crowds(detections)
     best = no_hypothesis()
     rival_dex = -np.inf
     checks = np.zeros(1, np.int64)
@@ -143,21 +144,20 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
     links = _no_links(len(sky.vectors))
     for hub in hubs:
         # 2. A hub, and the partners of the least cost.
-        partners = np.argsort(cost[hub])[:PARTNERS]
-        for p in range(min(len(partners), len(hubs) - 1)):
+        most = min(PARTNERS, len(hubs) - 1)
+        partners = np.argsort(_pair_costs(detections, crowd, hub))[:most]
+        for p in range(most):
             # 3. to 6. Test the triangles of the hub, this partner and an earlier one.
             candidate = _test_partner(
                 detections, sky, hub, partners[: p + 1], links, best, checks
             )
-            same = _same_attitude(candidate, best)
+            # The lesser of two attitudes is a rival.
+            if not _same_attitude(candidate, best):
+                rival_dex = max(rival_dex, min(candidate.dex, best.dex))
             if candidate.dex > best.dex:
-                # The previous best becomes a rival unless it is the same attitude.
-                rival_dex = rival_dex if same else max(rival_dex, best.dex)
                 if best.dex < ACCEPT_DEX <= candidate.dex:
                     limit = min(max_checks, (1 + RIVAL_EFFORT) * checks[0] + MIN_RIVAL_EFFORT)
                 best = candidate
-            elif not same:
-                rival_dex = max(rival_dex, candidate.dex)
             # 7. A decisive attitude needs no search for rivals.
             if best.dex >= DECISIVE_DEX:
                 return best
@@ -184,38 +184,48 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
 
 @jit
-def _pair_costs(detections: Detections) -> tuple[Floats, NDArray]:
-    """Costs of all pairs of detections, and the order of the hubs.
+def _crowds(detections: Detections) -> tuple[Floats, NDArray]:
+    """Numbers of detections within SHORTEST of the field, and the hubs: those first that are bright and alone.
 
-        cost = s_ab sqrt(sa^2 + sb^2) c_a c_b
-
-    The expected number of catalog pairs in a gate grows with the separation s_ab and with the width of the gate. A
-    detection among c - 1 others within SHORTEST of
-    the field is less probably a star the more there are: a clump of false lights counts as one. A pair shorter than
-    SHORTEST hardly determines the roll: it is given a separation beyond all others, the greater the shorter it is.
+    A detection among c - 1 others is less probably a star the more there are: a clump of false lights counts as one.
 
     Returns
     -------
-    cost
-        (N, N) costs, infinite on the diagonal
-    hubs
-        (N,) rows of the detections, those first that are bright and alone
+    crowd, hubs
+        (N,) numbers c, and rows of the detections
     """
     total = len(detections.sigma)
-    min_length = SHORTEST * sqrt(field_area(detections))
     crowd = np.ones(total)
-    cost = np.full((total, total), np.inf)
+    least2 = SHORTEST * SHORTEST * field_area(detections)
     for a in range(total):
-        for b in range(a + 1, total):
-            length = separation(detections.tangent, a, b)
-            # A short pair comes after all others.
-            if length < min_length:
+        for b in range(a):
+            if squared_separation(detections.tangent, a, b) < least2:
                 crowd[a] += 1
                 crowd[b] += 1
-                length = 1e3 * min_length * min_length / max(length, 1e-9)
-            cost[a, b] = length * hypot(detections.sigma[a], detections.sigma[b])
-            cost[b, a] = cost[a, b]
-    return cost * np.outer(crowd, crowd), np.argsort((np.arange(total) + 1) * crowd)
+    return crowd, np.argsort((np.arange(total) + 1) * crowd)
+
+
+@jit
+def _pair_costs(detections: Detections, crowd: Floats, hub: int) -> Floats:
+    """(N,) costs of the pairs of a hub and each detection, infinite for the hub itself.
+
+        cost = s_ab sqrt(sa^2 + sb^2) c_a c_b
+
+    The expected number of catalog pairs in a gate grows with the separation s_ab and with the width of the gate. c is
+    `crowd` (`_crowds`). A pair shorter than SHORTEST hardly determines the roll: it is given a separation beyond all
+    others, the greater the shorter it is.
+    """
+    cost = np.empty(len(crowd))
+    min_length = SHORTEST * sqrt(field_area(detections))
+    for n in range(len(crowd)):
+        length = separation(detections.tangent, hub, n)
+        # A short pair comes after all others.
+        if length < min_length:
+            length = 1e3 * min_length * min_length / max(length, 1e-9)
+        error = hypot(detections.sigma[hub], detections.sigma[n])
+        cost[n] = length * error * (crowd[hub] * crowd[n])
+    cost[hub] = np.inf
+    return cost
 
 
 class Links(NamedTuple):
@@ -225,10 +235,10 @@ class Links(NamedTuple):
     ----------
     last
         (S,) entry that was added last of each star, plus 1; 0 without one
-    hub, star, previous
-        (L,) of each entry: star of the hub, star of the partner, and the entry before it of the same hub, plus 1
-    partner, ratio
-        (L,) number of the partner, and the focal ratio by the separation
+    entry
+        (L, 4) star of the hub, star of the partner, number of the partner, and entry before it of the same hub, plus 1
+    ratio
+        (L,) focal ratio by the separation
     total
         (1,) number of entries
     closed
@@ -236,10 +246,7 @@ class Links(NamedTuple):
     """
 
     last: NDArray[np.int32]
-    hub: NDArray[np.int32]
-    star: NDArray[np.int32]
-    previous: NDArray[np.int32]
-    partner: NDArray[np.int32]
+    entry: NDArray[np.int32]
     ratio: Floats
     total: NDArray[np.int64]
     closed: NDArray[np.int64]
@@ -250,10 +257,7 @@ def _no_links(stars: int) -> Links:
     """No entry for any star: zeros, which take no time, as the system provides them when they are used."""
     return Links(
         np.zeros(stars, np.int32),
-        np.empty(MAX_LINKS, np.int32),
-        np.empty(MAX_LINKS, np.int32),
-        np.empty(MAX_LINKS, np.int32),
-        np.empty(MAX_LINKS, np.int32),
+        np.empty((MAX_LINKS, 4), np.int32),
         np.empty(MAX_LINKS),
         np.zeros(1, np.int64),
         np.empty((MAX_CLOSED, 2), np.int64),
@@ -263,7 +267,8 @@ def _no_links(stars: int) -> Links:
 @jit
 def _clear(links: Links) -> None:
     """Remove all entries."""
-    links.last[links.hub[: links.total[0]]] = 0
+    for n in range(links.total[0]):
+        links.last[links.entry[n, 0]] = 0
     links.total[0] = 0
 
 
@@ -356,9 +361,9 @@ def _close(
     """
     # Tuple members are unpacked here: in the loop each access would cost two updates of a reference count.
     pair, first, low, high, bin_rad = pairs
-    last, hub_star, partner_star, before, partner_number, ratios, total, closed = links
+    last, entries, ratios, total, closed = links
     mag_hub, mag_partner, mag_gate = mags
-    p = len(wanted) - 1
+    p = np.int32(len(wanted) - 1)
     ratio = 1.0
     count = total[0]
     found = 0
@@ -369,19 +374,20 @@ def _close(
             ratio = chord / (2 * np.sin((cell + 0.5) * bin_rad / 2))
         for row in range(2 * first[cell], 2 * first[cell + 1]):
             # Each pair in both orders; magnitudes first, as they need no geometry.
-            i = pair[row // 2, row % 2]
-            k = pair[row // 2, 1 - row % 2]
+            i = pair[row >> 1, row & 1]
+            k = pair[row >> 1, ~row & 1]
             if not _alike(mag_hub - mag[i], mag_partner - mag[k], mag_gate):
                 continue
             entry = last[i]
             while entry:
                 n = entry - 1
-                entry = before[n]
-                q = partner_number[n]
+                j = entries[n, 1]
+                q = entries[n, 2]
+                entry = entries[n, 3]
                 tests += 1
                 if q == p or abs(ratios[n] / ratio - 1) > wanted[q, 3]:
                     continue
-                star_j = vectors.row(star, partner_star[n])
+                star_j = vectors.row(star, j)
                 star_k = vectors.row(star, k)
                 if abs(vectors.chord(star_j, star_k) * ratio - wanted[q, 0]) > wanted[q, 1]:
                     continue
@@ -391,12 +397,9 @@ def _close(
                 if found < len(closed):
                     closed[found] = i, k
                     found += 1
-            if count < len(hub_star):
-                hub_star[count] = i
-                partner_star[count] = k
-                partner_number[count] = p
+            if count < len(entries):
+                entries[count] = i, k, p, last[i]
                 ratios[count] = ratio
-                before[count] = last[i]
                 count += 1
                 last[i] = count
     total[0] = count
@@ -467,8 +470,7 @@ def pair_hypothesis(
     star_b = vectors.row(sky.vectors, j)
     ratio = 1.0
     if detections.focal_uncertainty > 0:
-        length = vectors.chord(ray(tangent, a, 1.0), ray(tangent, b, 1.0))
-        ratio = fit_focal_ratio(tangent, a, b, length, vectors.chord(star_a, star_b))
+        ratio = fit_focal_ratio(tangent, a, b, vectors.chord(star_a, star_b))
         if abs(ratio - 1) > FOCAL_MARGIN * detections.focal_uncertainty:
             return no_hypothesis()
     # The attitude turns the axes of the stars into those of the detections.
@@ -519,15 +521,13 @@ def _pair_range(
 
 
 @jit
-def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float) -> float:
+def fit_focal_ratio(tangent: Floats, a: int, b: int, target: float) -> float:
     """The focal ratio at which the chord between two detections is `target`.
 
-    A chord is nearly proportional to 1 / focal length: f <- f chord(f) / target converges in two iterations.
+    A chord is nearly proportional to 1 / focal length: f <- f chord(f) / target converges in three iterations.
 
     Parameters
     ----------
-    chord
-        Chord between the two rays at the assumed focal length
     target
         Chord between the two stars
 
@@ -536,9 +536,9 @@ def fit_focal_ratio(tangent: Floats, a: int, b: int, chord: float, target: float
     float
         Ratio of the true to the assumed focal length
     """
-    focal_ratio = chord / target
+    focal_ratio = 1.0
     # f <- f chord(f) / target
-    for _ in range(2):
+    for _ in range(3):
         focal_ratio *= (
             vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
         )

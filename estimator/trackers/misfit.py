@@ -12,9 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from estimator.attitude.systematic import geometry
 from estimator.attitude.wahba import matrix_of
 from estimator.catalog.sky_index import SkyIndex, nearest
 from estimator.core import least_squares, vectors
@@ -24,7 +22,7 @@ from estimator.core.constants import ARCSEC_RAD
 from estimator.core.jit import jit
 from estimator.core.least_squares import PRIOR_RIGHT
 from estimator.identification import star_evidence, star_search
-from estimator.identification.chance import GATE_SIGMA
+from estimator.identification.chance import GATE_SIGMA, least
 from estimator.identification.star_detections import (
     Detections,
     FlatCentroids,
@@ -344,9 +342,10 @@ ROUNDS = 4
 CHANGED = 0.9  # share of a star's information below which the field is fitted again
 
 
+@jit
 def are_small(sigma_rad: Floats) -> bool:
     """Return whether companions are undetectable: their greatest error is below the error of every centroid."""
-    return bool(sigma_rad.min(initial=np.inf) > ERROR_RAD[-1])
+    return least(sigma_rad) > ERROR_RAD[-1]
 
 
 def with_companions(
@@ -373,25 +372,26 @@ def with_companions(
     changed = detections
     for _ in range(ROUNDS):
         # 1. Prediction by the other stars
-        seen = Rotation.from_quat(best.cam_from_ref_xyzw).apply(sky.vectors[best.star])
-        view = geometry(seen, seen)
-        residual = detections.tangent[best.observed] - best.focal_ratio * view.tangent
+        R_cam_from_ref = matrix_of(best.cam_from_ref_xyzw)
+        x, y, z = R_cam_from_ref @ sky.vectors[best.star].T
+        x /= z
+        y /= z
+        residual = detections.tangent[best.observed].T - best.focal_ratio * np.array([x, y])
+        jacobian = np.array([[-x * y, 1 + x * x, -y], [-1 - y * y, x * y, x]])
         own, used = (
-            information_of(one.weight[best.observed]) for one in (detections, changed)
+            information_of(one.weight[best.observed]).T for one in (detections, changed)
         )
-        alone, spread = prediction_by_others(residual, view.jacobian, used)
+        alone, spread = prediction_by_others(residual, jacobian, used)
         # 2. Mean information
         mean = mean_information(own, alone, spread)
-        before = changed.weight[best.observed]
+        if np.min(np.diagonal(mean) / np.diagonal(used)) > CHANGED:
+            break
         weight = detections.weight.copy()
         sigma = detections.sigma.copy()
-        weight[best.observed] = mean[:, [0, 1, 0], [0, 1, 1]]
-        sigma[best.observed] = 1 / np.sqrt(np.linalg.eigvalsh(mean)[:, 0])
-        if np.min(weight[best.observed][:, :2] / before[:, :2]) > CHANGED:
-            break
+        weight[best.observed] = mean[[0, 1, 0], [0, 1, 1]].T
+        sigma[best.observed] = 1 / np.sqrt(np.linalg.eigvalsh(mean.T)[:, 0])
         # 3. New attitude
         tried = detections._replace(weight=weight, sigma=sigma)
-        R_cam_from_ref = Rotation.from_quat(best.cam_from_ref_xyzw).as_matrix()
         found = star_evidence.evaluate(
             tried, sky, R_cam_from_ref, best.focal_ratio, GATE_SIGMA * sigma, -np.inf
         )
@@ -405,50 +405,48 @@ def with_companions(
 def prediction_by_others(
     residual: Floats, jacobian: Floats, information: Floats
 ) -> tuple[Floats, Floats]:
-    """Predict each star from all others: return its (K, 2) residuals, and the predictions' (K, 2, 2) covariances.
+    """Predict each star from all others: return its (2, K) residuals, and the predictions' (2, 2, K) covariances.
 
-    N is the information of the attitude from all stars, J^T W J that of one star. Without this star the attitude moves
-    by -(N - J^T W J)^-1 J^T W r, and the star's predicted position has the covariance J (N - J^T W J)^-1 J^T.
+    N is the information of the attitude from all stars, J^T W J that of one star. Predicted by all, a star has the
+    covariance H = J N^-1 J^T; without itself J (N - J^T W J)^-1 J^T = P = (H^-1 - W)^-1. The residual grows by P W r.
 
     Parameters
     ----------
     residual, jacobian, information
-        (K, 2) residuals r, (K, 2, 3) Jacobians J and (K, 2, 2) inverse covariances W, for the
+        (2, K) residuals r, (2, 3, K) Jacobians J and (2, 2, K) inverse covariances W, for the
         attitude that fits all stars
     """
-    weighted = jacobian.mT @ information
-    each = weighted @ jacobian
-    others = each.sum(axis=0) - each
-    # N - J^T W J, inverted with a unit diagonal and a small term against singular matrices
-    size = np.sqrt(np.einsum("kii->ki", others))
-    scaled = others / (size[:, :, None] * size[:, None, :]) + 1e-9 * np.eye(3)
-    covariance = np.linalg.inv(scaled) / (size[:, :, None] * size[:, None, :])
-    moved = (covariance @ weighted @ residual[:, :, None])[:, :, 0]
-    alone = residual + np.einsum("kij,kj->ki", jacobian, moved)
-    return alone, jacobian @ covariance @ jacobian.mT
+    normal = np.einsum("aik,abk,bjk->ij", jacobian, information, jacobian)
+    by_all = np.einsum("aik,ij,bjk->abk", jacobian, np.linalg.inv(normal), jacobian)
+    spread = _inverse(_inverse(by_all) - information)
+    return residual + np.einsum("abk,bck,ck->ak", spread, information, residual), spread
 
 
 def mean_information(information: Floats, residual: Floats, spread: Floats) -> Floats:
-    """Return sum_j g_j (S + c_j^2 I)^-1, (K, 2, 2): mean inverse covariances of stars (`with_companions`).
+    """Return sum_j g_j (S + c_j^2 I)^-1, (2, 2, K): mean inverse covariances of stars (`with_companions`).
 
     Parameters
     ----------
     information
-        (K, 2, 2) S^-1, inverse covariance of each centroid alone
+        (2, 2, K) S^-1, inverse covariance of each centroid alone
     residual, spread
-        (K, 2) residuals r from the prediction by the others, and its (K, 2, 2) covariance P
+        (2, K) residuals r from the prediction by the others, and its (2, 2, K) covariance P
     """
-    # S + c_j^2 I, and with the prediction's P
-    excess = ERROR_RAD[:, None, None, None] ** 2 * np.eye(2)
-    covariance = np.linalg.inv(information) + excess
-    total = covariance + spread
-    distance2 = np.einsum("ki,jkim,km->jk", residual, np.linalg.inv(total), residual)
-    # Posterior probabilities g_j, from ln p_j - ln det / 2 - r^T (S + P + c_j^2 I)^-1 r / 2
-    log_density = (
-        np.log(SHARE)[:, None] - 0.5 * np.log(np.linalg.det(total)) - 0.5 * distance2
+    # S + c_j^2 I, and with the prediction's P: (2, 2, J, K)
+    wide = _inverse(information)[:, :, None] + np.multiply.outer(
+        np.eye(2), ERROR_RAD[:, None] ** 2
     )
+    total = _inverse(wide + spread[:, :, None])
+    distance2 = np.einsum("ak,abjk,bk->jk", residual, total, residual)
+    # Posterior probabilities g_j, from ln p_j - ln det / 2 - r^T (S + P + c_j^2 I)^-1 r / 2
+    log_det = np.linalg.slogdet(total.T)[1].T
+    log_density = np.log(SHARE)[:, None] + (log_det - distance2) / 2
     probability = np.exp(log_density - log_density.max(axis=0))
     probability /= probability.sum(axis=0)
-    return np.asarray(
-        np.einsum("jk,jkim->kim", probability, np.linalg.inv(covariance)), dtype=float
-    )
+    return np.asarray(np.einsum("jk,abjk->abk", probability, _inverse(wide)))
+
+
+def _inverse(matrix: Floats) -> Floats:
+    """Return the inverses of (2, 2, ...) matrices: in a tenth of the time of `np.linalg.inv`."""
+    (a, b), (c, d) = matrix
+    return np.array([[d, -b], [-c, a]]) / (a * d - b * c)

@@ -5,8 +5,9 @@ from its reflection, and the search stops at the first that it finds. `with_riva
 an attitude leaves unmatched:
 
 1. Skip frames whose unmatched lights are too few for a comparable rival.
-2. Search the unmatched lights for a short time, as those of a frame (`star_search`). The zero point follows from the
-   matched stars. This finds another sky where most of the bright unmatched lights are its stars.
+2. Search the unmatched lights for a short time, as those of a frame (`star_search`, in a deep sky `star_quads`). The
+   zero point follows from the matched stars. This finds another sky where most of the bright unmatched lights are its
+   stars.
 3. A rival has the evidence of an accepted attitude among the unmatched lights. A lens or a shutter that does not fit
    its model also leaves stars unmatched, which fit a second, slightly different attitude; but each star is then seen
    once. Such a solution is no rival, and neither is one that the covariance of the first attitude covers. Repeat from
@@ -32,12 +33,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from estimator.catalog.quad_index import QuadIndex
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
 from estimator.core.types import Attitude, Centroids, StarMatch
-from estimator.identification import star_search
+from estimator.identification import star_quads, star_search
 from estimator.identification.chance import (
     MIN_EVIDENCE_MATCHES,
     MIN_MATCHES,
@@ -57,7 +59,9 @@ from estimator.trackers.refinement import FieldMatcher
 LOG10_COMPARABLE = -3.0
 MOST_RIVALS = 3
 MOST_LIGHTS = 20  # unmatched lights that are searched
-MAX_CHECKS = 5000  # effort of the search
+# Efforts of the search by pairs and by quads, which find as many second skies
+MAX_CHECKS = 5000
+QUAD_CHECKS = 20_000
 MAGNITUDE_SIGMA = 0.3  # least error of a difference of magnitudes
 SAME_SIGMAS = 5.0  # difference of attitudes that the covariance of the first one covers
 SAME_RAD = 0.1  # difference of attitudes that no misfit of the camera model causes
@@ -70,6 +74,7 @@ def with_rivals(
     sensor: Sensor,
     sky: SkyIndex,
     matcher: FieldMatcher,
+    quads: QuadIndex | None,
 ) -> Attitude:
     """Return an attitude with its rivals, or the refusal of an ambiguous one: the numbered steps of the module.
 
@@ -79,6 +84,8 @@ def with_rivals(
         Solution of the frame; a refusal is returned as it is
     errors_px
         Function that returns the (N,) total errors of centroids
+    quads
+        Quads of a deep sky, which are searched in place of its pairs
     """
     match = attitude.match
     camera = attitude.camera
@@ -113,7 +120,7 @@ def with_rivals(
                 zero_point_mag=float(np.mean(zero_mag)),
                 magnitude_sigma=hypot(MAGNITUDE_SIGMA, np.std(zero_mag)),
             )
-            found = _find(lights, view, sky, rest)
+            found = _find(lights, view, sky, rest, quads)
             if len(found.star):
                 break
         if not len(found.star):
@@ -168,10 +175,17 @@ def _is_comparable(matches: int, fewer: int, share: float) -> bool:
 
 
 @jit
-def _find(lights: FlatCentroids, sensor: Sensor, sky: SkyIndex, rest: NDArray) -> Solution:
+def _find(
+    lights: FlatCentroids,
+    sensor: Sensor,
+    sky: SkyIndex,
+    rest: NDArray,
+    quads: QuadIndex | None,
+) -> Solution:
     """Search some rows of the lights for a second sky: step 2 of the module; one call of compiled code is faster."""
-    detections = chosen(detections_of(lights, sensor, 0.0), rest)
     # Not as constants, for which numba would compile the whole search once more.
-    return star_search.lost_in_space(
-        detections, sky, np.int64(MOST_LIGHTS), np.int64(MAX_CHECKS)
-    )
+    most = np.int64(MOST_LIGHTS)
+    detections = chosen(detections_of(lights, sensor, 0.0), rest)
+    if quads is None:
+        return star_search.lost_in_space(detections, sky, most, np.int64(MAX_CHECKS))
+    return star_quads.identify(detections, quads, sky, most, np.int64(QUAD_CHECKS), False)

@@ -52,6 +52,8 @@ CALIBRATED_SEARCHES = (
     SearchModel(0.5, 0.003, 10_000),
     SearchModel(MIN_ERROR_PX, 0.0, 25_000),
 )
+# Of a deep sky, whose separations have hundreds of candidates
+DEEP_SEARCHES = (WRONG_FOCAL_SEARCH._replace(max_checks=150_000), *CALIBRATED_SEARCHES)
 UNCALIBRATED_SEARCHES = (
     SearchModel(MIN_ERROR_PX, 0.0, 10_000, True),
     SearchModel(MIN_ERROR_PX, 0.0, 100_000, True),

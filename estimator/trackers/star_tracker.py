@@ -65,6 +65,7 @@ from estimator.trackers.rivals import with_rivals
 from estimator.trackers.rolling_shutter import Lights, solve_lights
 from estimator.trackers.search_models import (
     CALIBRATED_SEARCHES,
+    DEEP_SEARCHES,
     FOCAL_MARGIN,
     MIN_ERROR_PX,
     UNCALIBRATED_SEARCHES,
@@ -138,14 +139,17 @@ class StarTracker(FrameTracker):
         self.settings = settings
         self.air = air
         self.focal_uncertainty = focal_uncertainty
-        self.searches = searches or (
-            UNCALIBRATED_SEARCHES if focal_uncertainty else CALIBRATED_SEARCHES
-        )
         # Stars that a frame can show, and the brighter ones among them that form patterns
         self.stars = catalog.merge_doubles(
             replace(stars, vectors=vectors), settings.merge_px / camera.focal_px
         )
         paired = int(min(settings.field_stars * 4 * np.pi / self._field_sr, len(self.stars)))
+        # Of so many stars not all pairs are indexed, and a separation has hundreds of candidates.
+        self.deep = paired >= index_file.FEW_STARS
+        calibrated = DEEP_SEARCHES if self.deep else CALIBRATED_SEARCHES
+        self.searches = searches or (
+            UNCALIBRATED_SEARCHES if focal_uncertainty else calibrated
+        )
         places = self.stars.vectors, self.stars.v_mag
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
@@ -353,7 +357,13 @@ class StarTracker(FrameTracker):
     ) -> Attitude:
         """Return the attitude, or an ambiguous answer if the unmatched lights are those of another sky."""
         attitude = with_rivals(
-            attitude, centroids, self.sigma_px, self.sensor, self.sky, self.field_matcher
+            attitude,
+            centroids,
+            self.sigma_px,
+            self.sensor,
+            self.sky,
+            self.field_matcher,
+            self.quads if self.deep else None,
         )
         clock.lap("identify")
         return attitude
@@ -556,15 +566,18 @@ class StarTracker(FrameTracker):
            also a field of view outside of its bounds, and a match that is not beyond chance.
         """
         status = NO_MATCH
+        own_px = self.sigma_px(centroids)
         for model in self.searches if effort is None else [self.searches[effort]]:
             # 1. Search
-            sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
+            sigma_px = own_px
+            if model.min_error_px > MIN_ERROR_PX or model.relative_error:
+                sigma_px = self.sigma_px(centroids, model.min_error_px, model.relative_error)
             solution, variance = self._search(centroids, sigma_px, model)
             clock.lap("identify")
             if not len(solution.star):
                 continue
             # 2. Residuals
-            refitted = self.refit(centroids, solution, sigma_px, variance)
+            refitted = self.refit(centroids, solution, sigma_px, variance, own_px)
             # 3. Wrong camera model
             reason = self.field_matcher.reason_against(refitted, centroids)
             if not reason:
@@ -618,6 +631,7 @@ class StarTracker(FrameTracker):
         solution: Solution,
         sigma_px: Floats,
         variance: float = 0.0,
+        own_px: Floats | None = None,
     ) -> Refit:
         """Return a solution with the errors and the camera that its residuals and the field imply.
 
@@ -632,6 +646,8 @@ class StarTracker(FrameTracker):
             (N,) total errors of the centroids
         variance
             Factor of the variances if the solution has been matched again already; else 0
+        own_px
+            (N,) total errors with the least error of a star
         """
         matcher = self.field_matcher
         same_focal = solution.focal_ratio == 1
@@ -639,8 +655,8 @@ class StarTracker(FrameTracker):
         if not len(solution.star):
             return Refit(solution, camera, 1.0)
         # 1. Errors
-        own_px = self.sigma_px(centroids)
-        exact = np.array_equal(own_px, sigma_px)
+        own_px = self.sigma_px(centroids) if own_px is None else own_px
+        exact = own_px is sigma_px or np.array_equal(own_px, sigma_px)
         known = exact and not self.focal_uncertainty
         settled = known and 0 < variance < misfit.TELLING
         if (

@@ -387,18 +387,16 @@ def test_every_catalog_pair_that_two_detections_may_be_is_in_their_range(zoom: f
 def test_a_pair_s_focal_ratio_makes_its_angle_the_catalog_s() -> None:
     for ratio in (0.97, 1.0, 1.03):
         target = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, ratio), PLAIN.ray(PLACES, 2, ratio))
-        seen = PLAIN.vectors.chord(PLAIN.ray(PLACES, 1, 1.0), PLAIN.ray(PLACES, 2, 1.0))
         # The fixed point contracts by about the square of a tangent, 5e-3, each time.
-        assert PLAIN.fit_focal_ratio(PLACES, 1, 2, seen, target) == pytest.approx(
-            ratio, abs=1e-6
-        )
+        assert PLAIN.fit_focal_ratio(PLACES, 1, 2, target) == pytest.approx(ratio, abs=1e-6)
 
 
 def test_pairs_cost_as_many_catalog_pairs_as_are_expected() -> None:
     """Length times error; a light among others costs as much as it has neighbors, and a short pair most."""
-    cost, hubs = PLAIN._pair_costs(unequal())
+    crowd, hubs = PLAIN._crowds(unequal())
     # The last one is 3 mrad from the first: both are crowded.
-    crowd = np.array([2, 1, 1, 1, 1, 2])
+    assert crowd.tolist() == [2, 1, 1, 1, 1, 2]
+    cost = np.array([PLAIN._pair_costs(unequal(), crowd, hub) for hub in range(6)])
     distance = np.linalg.norm(PLACES[:, None] - PLACES, axis=2)
     expected = distance * np.hypot(UNEQUAL[:, None], UNEQUAL) * crowd[:, None] * crowd
     far = distance > 0.01

@@ -136,7 +136,12 @@ def test_a_star_s_prediction_comes_from_a_fit_without_it(seed: int, count: int) 
 
     every = np.arange(count)
     at_best = residual - jacobian @ fit(every)[0]
-    alone, spread = misfit.prediction_by_others(at_best, jacobian, information)
+    alone, spread = (
+        one.T
+        for one in misfit.prediction_by_others(
+            at_best.T, np.moveaxis(jacobian, 0, 2), information.T
+        )
+    )
     for k in range(count):
         step, covariance = fit(np.delete(every, k))
         assert alone[k] == pytest.approx(residual[k] - jacobian[k] @ step, rel=1e-3, abs=1e-3)
@@ -151,11 +156,10 @@ def test_a_star_loses_information_only_by_what_companions_explain(
     sigma: float, off: float, spread: float
 ) -> None:
     """In arcseconds: between that of its centroid and that of a star with the greatest error."""
-    own = np.eye(2)[None] / (sigma * ARCSEC_RAD) ** 2
-    residual = np.array([[off, 0.0]]) * ARCSEC_RAD
-    mean = misfit.mean_information(
-        own, residual, (spread * ARCSEC_RAD) ** 2 * np.eye(2)[None]
-    )[0]
+    unit = np.eye(2)[:, :, None]
+    own = unit / (sigma * ARCSEC_RAD) ** 2
+    residual = np.array([[off], [0.0]]) * ARCSEC_RAD
+    mean = misfit.mean_information(own, residual, (spread * ARCSEC_RAD) ** 2 * unit)[:, :, 0]
     least = 1 / (sigma**2 + (ERROR_RAD.max() / ARCSEC_RAD) ** 2)
     share = np.diag(mean) * (sigma * ARCSEC_RAD) ** 2
     assert (share <= 1 + 1e-9).all()

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
+from estimator.catalog import index_file, sky_index
 from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Attitude, Centroids
 from estimator.identification.refusals import AMBIGUOUS, NO_LIGHTS, NO_STARS, WRONG_SCALE
 from estimator.trackers import rivals
+from estimator.trackers.search_models import DEEP_SEARCHES
 from estimator.trackers.star_tracker import StarTracker
 from tests.helpers.laws import SEEDS, law
 
@@ -57,16 +61,38 @@ def test_one_sky_has_no_rival_among_false_lights(rng: np.random.Generator) -> No
     refused = Attitude(NO_STARS)
     sky = TRACKER.sky
     matcher = TRACKER.field_matcher
-    same = rivals.with_rivals(refused, frame, TRACKER.sigma_px, TRACKER.sensor, sky, matcher)
+    same = rivals.with_rivals(
+        refused, frame, TRACKER.sigma_px, TRACKER.sensor, sky, matcher, None
+    )
     assert same is refused
 
 
+@pytest.fixture(params=["by pairs", "by quads"])
+def tracker(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> StarTracker:
+    """A tracker of a shallow sky, and one that takes the same stars for a deep sky."""
+    if request.param == "by pairs":
+        return TRACKER
+    monkeypatch.setenv("ESTIMATOR_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(index_file, "FEW_STARS", 0)
+    deep = StarTracker.for_sky(CAMERA)
+    assert deep.searches == DEEP_SEARCHES
+    assert deep.searches[0].by_quads
+    # Neither the frame nor its rivals are found by pairs.
+    deep.searches = deep.searches[:1]
+    deep.sky = sky_index.build_without_pairs(deep.sky.vectors, deep.sky.mag)
+    return deep
+
+
 @pytest.mark.parametrize("turn", TURNS, ids=["half turn", "shift"])
-def test_two_comparable_skies_are_ambiguous_and_both_are_reported(turn: Rotation) -> None:
+def test_two_comparable_skies_are_ambiguous_and_both_are_reported(
+    turn: Rotation, tracker: StarTracker
+) -> None:
     """Whichever of the two the search finds first, no attitude is answered."""
     for truth in Rotation.random(5, rng=3):
         frame = lights((truth, 0.0, 100), (turn * truth, 0.5, 100))
-        answer = TRACKER.solve_centroids(frame)
+        answer = tracker.solve_centroids(frame)
         assert (answer.status, answer.cam_from_ref) == (AMBIGUOUS, None)
         for sky in (truth, turn * truth):
             off = [(one.cam_from_ref * sky.inv()).magnitude() for one in answer.rivals]
