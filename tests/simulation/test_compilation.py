@@ -2,9 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 
-from skysim.core.paths import SCENES
+from skysim.core.paths import ROOT, SCENES
 from skysim.scene import loader
 from skysim.simulation.compilation import synthetic_frame
 from skysim.simulation.lab import build_lab, build_tracker
@@ -16,6 +22,23 @@ CODED = {"coded_spiral"}  # a frame alone does not name its LEDs
 NAMES = (
     {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC - CODED
 )
+# Prints the modules of all functions that numba compiles for a command.
+MODULES = """
+import json, sys
+from numba.core import event
+from skysim.apps.cli.main import main
+found = set()
+class Modules(event.Listener):
+    def on_start(self, compilation):
+        found.add(compilation.data["dispatcher"].py_func.__module__)
+    def on_end(self, _):
+        pass
+event.register("numba:compile", Modules())
+try:
+    main()
+finally:
+    json.dump(sorted(found), open("modules.json", "w"))
+"""
 
 
 @pytest.mark.slow
@@ -27,3 +50,16 @@ def test_the_synthetic_frame_is_solved(name: str) -> None:
         build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
     )
     assert report.attitude.status == "solved"
+
+
+@pytest.mark.slow
+def test_a_frame_of_stars_compiles_neither_ellipses_nor_text(tmp_path: Path) -> None:
+    """The images of disks are a third of the renderer; numba's texts of errors take seconds (`a[i] = array`)."""
+    cache = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
+    words = ["render", "shefex2", "--frames", "1", "--out", "frames"]
+    command = [sys.executable, "-c", MODULES, *words]
+    subprocess.run(command, cwd=tmp_path, env=cache, check=True, capture_output=True)
+    compiled = json.loads((tmp_path / "modules.json").read_text())
+    assert "skysim.camera.psf.splat" in compiled
+    assert "skysim.camera.psf.ellipse" not in compiled
+    assert "numba.cpython.unicode" not in compiled
