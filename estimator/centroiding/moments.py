@@ -107,7 +107,10 @@ def _weighted_mean(
         variance = noise2.sum() / total**2
         if power == 2:
             variance += sampling_variance((share * distance2).sum() / total)
-        out[k] = cx, cy, sqrt(variance), light.sum()
+        out[k, 0] = cx
+        out[k, 1] = cy
+        out[k, 2] = sqrt(variance)
+        out[k, 3] = light.sum()
     return out
 
 

@@ -122,7 +122,8 @@ def lost_in_space(
     return fit_to_all(free, stars, candidate, calibrated)
 
 
-@jit
+# Inlined, as is `_test_partner`: LLVM optimizes a called function once more with each of its callers.
+@jit(inline="always")
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """Steps 2 to 8: search one set of detections for the attitude.
 
@@ -272,7 +273,7 @@ def _clear(links: Links) -> None:
     links.total[0] = 0
 
 
-@jit
+@jit(inline="always")
 def _test_partner(
     detections: Detections,
     sky: SkyIndex,

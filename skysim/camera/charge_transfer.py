@@ -187,7 +187,9 @@ def _delay_rows(electrons: NDArray, fraction: Floats) -> None:
                 packets = electrons[y - k, first:last]
                 for x in range(len(gathered)):
                     gathered[x] += weight * packets[x]
-            electrons[y, first:last] = gathered
+            row = electrons[y, first:last]
+            for x in range(len(gathered)):
+                row[x] = gathered[x]
 
 
 @jit(parallel=True)
@@ -202,14 +204,14 @@ def _delay_columns(electrons: NDArray, fraction: NDArray) -> None:
     height, width = electrons.shape
     for y in numba.prange(height):
         row = electrons[y]
-        gathered = np.zeros(width, electrons.dtype)
+        packets = row.copy()
+        row[:] = 0
         # new[x + k] += fraction[k, x] old[x].
         for k in range(min(len(fraction), width)):
             weight = fraction[k]
-            late = gathered[k:]
+            late = row[k:]
             for x in range(len(late)):
-                late[x] += weight[x] * row[x]
-        row[:] = gathered
+                late[x] += weight[x] * packets[x]
 
 
 @jit(parallel=True)

@@ -215,6 +215,8 @@ def draw(
     areas = (boxes[:, 1] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 2])
     out = np.zeros((len(boxes), 8))
     budget = max(image.size, MAX_PATCH_PIXELS)
+    # None: numba then leaves out the code of ellipses, the greater part of the renderer's, which a sky does not need.
+    bessel = kernels.bessel if len(kernels.bessel) else None
     first = 0
     while first < len(boxes):
         # As many patches at once as memory allows, at least one.
@@ -223,8 +225,9 @@ def draw(
         starts = np.concatenate([[0], total[: last - first]])
         buffer = np.zeros(starts[-1])
         # Patches are drawn in parallel and added in order, so the sum does not depend on threads.
-        _draw(buffer, starts, boxes[first:last], first, tracks, kernels, step_px, window, out)
-        _deposit(image, buffer, starts, boxes[first:last])
+        parts = boxes[first:last]
+        _draw(buffer, starts, parts, first, tracks, kernels, bessel, step_px, window, out)
+        _deposit(image, buffer, starts, parts)
         first = last
     return out
 
@@ -264,6 +267,7 @@ def _draw(
     first: int,
     tracks: Tracks,
     kernels: Kernels,
+    bessel: Singles | None,
     step_px: Floats,
     window: Window,
     out: Any,
@@ -281,6 +285,7 @@ def _draw(
                 first + i,
                 tracks,
                 kernels,
+                bessel,
                 step_px[first + i],
                 window,
                 out[first + i],
@@ -296,6 +301,7 @@ def _expose_source(
     n: int,
     tracks: Tracks,
     kernels: Kernels,
+    bessel: Singles | None,
     step_px: float,
     window: Window,
     row: Any,
@@ -306,8 +312,8 @@ def _expose_source(
     """
     end_s = window.open_s + window.exposure_s
     # The table of an ellipse is made for this source alone; other kinds share tables.
-    table = _sampled(n, kernels)
-    if len(table):
+    table = None if bessel is None else _sampled(n, kernels)
+    if table is not None and len(table):
         step_px *= sharpest_px(table)
     row[5] = _length(tracks, n, window.open_s, end_s)
     # Without a rolling shutter all rows share one integral; with it each row needs its own interval.
@@ -346,7 +352,7 @@ def _integrate(
     n: int,
     tracks: Tracks,
     kernels: Kernels,
-    table: Singles,
+    table: Singles | None,
     step_px: float,
     begin_s: float,
     end_s: float,
@@ -415,7 +421,7 @@ def _splat_point(
     electrons: float,
     n: int,
     kernels: Kernels,
-    table: Singles,
+    table: Singles | None,
 ) -> None:
     """Add the image of a point of light at (x, y) of the patch, by the source's kind of kernel."""
     # Numbers of a table: its place in `tables` and the size of its axes.
@@ -424,7 +430,7 @@ def _splat_point(
         add_gaussian(patch, row0, row1, x, y, electrons, kernels.sigma_px[n])
     elif kernels.kind[n] == ROUND:
         add_round(patch, row0, row1, x, y, electrons, kernels.tables[begin:end].reshape(p, q))
-    elif kernels.kind[n] == ELLIPSE:
+    elif table is not None and kernels.kind[n] == ELLIPSE:
         add_ellipse(
             patch,
             row0,

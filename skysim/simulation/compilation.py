@@ -10,6 +10,7 @@ and estimator share no compiled function, so two processes can compile them at o
    from numba's cache.
 """
 
+import gc
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping, Sequence
@@ -108,6 +109,7 @@ def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
 
 if __name__ == "__main__":
     # Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
+    gc.disable()  # a short life: collecting the compiler's objects takes 6 % of it
     name, *texts = sys.argv[1:]
     try:
         lab = build_lab(loader.load(name, parse_overrides(texts)))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
+import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from skysim.core.paths import SCENES
+from skysim.core.paths import ROOT, SCENES
 from skysim.scene import loader
 from skysim.simulation.compilation import synthetic_frame
 from skysim.simulation.lab import build_lab, build_tracker
@@ -19,20 +22,24 @@ CODED = {"coded_spiral"}  # a frame alone does not name its LEDs
 NAMES = (
     {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC - CODED
 )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(NAMES))
-def test_the_synthetic_frame_is_solved(name: str) -> None:
-    """A frame that is refused earlier would leave the later stages to be compiled in the first process."""
-    lab = build_lab(loader.load(name))
-    report = factory.solve_frame(
-        build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
-    )
-    assert report.attitude.status == "solved"
-
-
-# With a second argument functions with fastmath are loaded from numba's cache before those that call them.
+# Prints the modules of all functions that numba compiles for a command.
+MODULES = """
+import json, sys
+from numba.core import event
+from skysim.apps.cli.main import main
+found = set()
+class Modules(event.Listener):
+    def on_start(self, compilation):
+        found.add(compilation.data["dispatcher"].py_func.__module__)
+    def on_end(self, _):
+        pass
+event.register("numba:compile", Modules())
+try:
+    main()
+finally:
+    json.dump(sorted(found), open("modules.json", "w"))
+"""
+# Prints light, centroids and attitude. With a second argument functions with fastmath are loaded from numba's cache before those that call them.
 FLY = """
 import sys
 from skysim.scene import loader
@@ -54,6 +61,17 @@ print(shot.solution.centroids.xy_px.tobytes().hex(), attitude.cam_from_ref.as_qu
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_the_synthetic_frame_is_solved(name: str) -> None:
+    """A frame that is refused earlier would leave the later stages to be compiled in the first process."""
+    lab = build_lab(loader.load(name))
+    report = factory.solve_frame(
+        build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
+    )
+    assert report.attitude.status == "solved"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["afit_simsat", "shefex2"])
 def test_a_frame_does_not_depend_on_the_functions_that_are_loaded_first(name: str) -> None:
     """A function is compiled again into each that calls it, and the copy that is loaded first serves all.
@@ -68,3 +86,16 @@ def test_a_frame_does_not_depend_on_the_functions_that_are_loaded_first(name: st
     )
     assert not plain.returncode, plain.stderr
     assert first.stdout == plain.stdout, first.stderr
+
+
+@pytest.mark.slow
+def test_a_frame_of_stars_compiles_neither_ellipses_nor_text(tmp_path: Path) -> None:
+    """The images of disks are a third of the renderer; numba's texts of errors take seconds (`a[i] = array`)."""
+    cache = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
+    words = ["render", "shefex2", "--frames", "1", "--out", "frames"]
+    command = [sys.executable, "-c", MODULES, *words]
+    subprocess.run(command, cwd=tmp_path, env=cache, check=True, capture_output=True)
+    compiled = json.loads((tmp_path / "modules.json").read_text())
+    assert "skysim.camera.psf.splat" in compiled
+    assert "skysim.camera.psf.ellipse" not in compiled
+    assert "numba.cpython.unicode" not in compiled
