@@ -46,7 +46,6 @@ OUT_OF_REACH = {
     "skysim.apps.cli.commands.measure.CameraGroup.parse_args": "words of the command line",
     "skysim.apps.cli.commands.measure.read_camera": "hands the file on to `loader` or `opencv_calibration.read`",
     "skysim.apps.cli.commands.study.load_stored_plan": "the store is read by `open_store`, the study by `loader.load`",
-    "skysim.apps.live.gige.GigeReceiver.read": "bytes of a register; the file in them is target `genicam`",
     "skysim.apps.live.http.Handler.do_GET": SHIPPED,
     "skysim.camera.glow.background.zodiacal_table": SHIPPED,
     "skysim.apps.live.ros.Topic.definition": SHIPPED,

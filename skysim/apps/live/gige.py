@@ -27,7 +27,7 @@ import time
 import uuid
 import zipfile
 from collections import deque
-from collections.abc import Container
+from collections.abc import Container, Iterator
 from enum import IntEnum
 from typing import Any
 from urllib.parse import urlsplit
@@ -213,7 +213,6 @@ class GigeCamera(Sink):
         """Set the registers to their first values."""
         camera = self.scene.camera
         detector = camera.detector
-        celsius = detector.temperature_c
         serial = uuid.getnode()
         for address, value in {
             0x0000: struct.pack(
@@ -245,7 +244,7 @@ class GigeCamera(Sink):
             # Whole microseconds: the longest exposure must not be refused for its rounding.
             LONGEST_US: 1e6 * self.live.commands.longest_exposure_s // 1,
             0xA020: 1 / detector.gain_e_dn,
-            CELSIUS: detector.dark_temperature_c if celsius is None else celsius,
+            CELSIUS: detector.own_c,
             0xA030: self.scene.exposure.rate_hz,
             XML: (DATA / "gige_camera.xml").read_bytes().ljust(XML_BYTES, b"\n"),
         }.items():
@@ -508,6 +507,7 @@ PATIENCE_S = 10.0  # for a whole frame
 MOST_PACKETS = 1 << 17  # of a frame: 96 million pixels of 16 bits
 MOST_XML_BYTES = 1 << 24
 READ_BYTES = 512
+FREE = "a camera that no other application controls (status 0x8006)"
 BUFFER_BYTES = 1 << 23  # of packets that wait; the system may allow less
 
 
@@ -542,7 +542,6 @@ class GigeReceiver:
         self.control = udp_socket()
         self.control.settimeout(ANSWER_S)
         self.stream = udp_socket()
-        self.stream.settimeout(POLL_S)
         self.stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
         # Without a host, for one that is not known, and a port that is none.
         with refusing((TypeError, OSError, ValueError), source, "no such address"):
@@ -572,7 +571,7 @@ class GigeReceiver:
             # 2. Control.
             self.write(PRIVILEGE, CONTROL)
             here, port = self.stream.getsockname()
-            if int.from_bytes(self.read(STREAM_PORT, 4)) & 0xFFFF != port:
+            if self.command(READREG, STREAM_PORT)[2:] != port.to_bytes(2):
                 start, self.stop = self.commands("AcquisitionStart", "AcquisitionStop")
                 self.write(PACKET_SIZE, PACKET_BYTES)
                 self.write(STREAM_ADDRESS, int.from_bytes(socket.inet_aton(here)))
@@ -581,12 +580,11 @@ class GigeReceiver:
             # 3. Packets.
             host, _ = self.control.getpeername()
             while time.monotonic() < end_s:
-                try:
-                    packet, sender = self.stream.recvfrom(PACKET_BYTES)
-                except TimeoutError:
+                if not select.select([self.stream], (), (), POLL_S)[0]:
                     self.write(PRIVILEGE, CONTROL)
                     continue
-                image = self.take(packet) if sender[0] == host else None
+                packet, (sender, _) = self.stream.recvfrom(PACKET_BYTES)
+                image = self.take(packet) if sender == host else None
                 if image is not None:
                     return image
             raise InputError(
@@ -616,50 +614,44 @@ class GigeReceiver:
                 status, answered, _, number = ANSWER.unpack_from(answer)
                 if (answered, number) != (command + 1, self.number):
                     continue
-                if status == GvcpStatus.ACCESS_DENIED:
-                    raise InputError("", "another application controls the camera")
                 if status:
-                    raise InputError("", f"refuses command {command:#x}: status {status:#x}")
+                    raise InputError(
+                        "", f"answers {command:#06x} by status {status:#06x}", FREE
+                    )
                 return answer[ANSWER.size :]
-        raise InputError(
-            "", "no GigE Vision camera answers", "one without another application"
-        )
-
-    def read(self, address: int, size: int) -> bytes:
-        """Bytes at an address. Raises InputError."""
-        return self.command(READMEM, address, size)[4:]
+        raise InputError("", "no GigE Vision camera answers", FREE)
 
     def write(self, address: int, value: int) -> None:
         """Write a register of 4 bytes. Raises InputError."""
         self.command(WRITEREG, address, value)
 
-    def commands(self, *names: str) -> list[tuple[int, int]]:
+    def commands(self, *names: str) -> Iterator[tuple[int, int]]:
         """Register and value of commands, by the camera's GenICam file, which may be packed. Raises InputError."""
         problem = f"no GenICam file in the camera that has plain registers for {names}"
         # A damaged file gives errors of many types.
         with refusing(Exception, "", problem):
-            text = self.read(XML_ADDRESS, READ_BYTES)
-            ((at, size),) = re.findall(rb"(?i)^local:[^;]*;([\da-f]+);([\da-f]+)", text)
+            ((at, size),) = re.findall(
+                rb"(?i)local:[^;]*;([\da-f]+);([\da-f]+)",
+                self.command(READMEM, XML_ADDRESS, READ_BYTES),
+            )
             first = int(at, 16)
             end = first + min(int(size, 16), MOST_XML_BYTES)
             # Registers have 4 bytes.
             data = b"".join(
-                self.read(at, min(READ_BYTES, end - at + -end % 4))
+                self.command(READMEM, at, min(READ_BYTES, end - at + -end % 4))[4:]
                 for at in range(first, end, READ_BYTES)
             )[: end - first]
             if data.startswith(b"PK"):
                 packed = zipfile.ZipFile(io.BytesIO(data))
                 data = packed.open(packed.namelist()[0]).read(MOST_XML_BYTES)
             root: Any = ElementTree.fromstring(data.strip(b"\0\n"))
-            found = []
             for name in names:
                 command = root.find(f".//{{*}}Command[@Name='{name}']")
                 value = int(command.findtext("{*}CommandValue"), 0)
                 node = root.find(f".//{{*}}IntReg[@Name='{command.findtext('{*}pValue')}']")
                 # Its address must be a number, to which nothing is added.
                 (address,) = (one.text for one in node if re.search("Addr|Ind|Kni", one.tag))
-                found.append((int(address, 0), value))
-        return found
+                yield int(address, 0), value
 
     # Frames
 
@@ -673,11 +665,10 @@ class GigeReceiver:
         """
         try:
             _, number, word = PACKET_HEAD.unpack_from(packet)
-            place = word & NUMBER
             if word == LEADER << 24:
                 self.block = number
                 self.parts.clear()
-            if (number, place) != (self.block, len(self.parts)) or place > MOST_PACKETS:
+            if number != self.block or not word & NUMBER == len(self.parts) < MOST_PACKETS:
                 return None
             self.parts.append(packet[PACKET_HEAD.size :])
             if word >> 24 != TRAILER:
@@ -689,9 +680,11 @@ class GigeReceiver:
                 return np.frombuffer(data, pixel_type(code)).reshape(height, width)
         except (ValueError, struct.error):
             return None
-        problem = f"sends payload {kind:#x} in pixel format {code:#010x}"
-        names = ", ".join(f"Mono{bits}" for bits in PIXEL_BITS.values())
-        raise InputError("", problem, f"images in {names} without padding")
+        raise InputError(
+            "",
+            f"sends payload {kind:#x} in pixel format {code:#010x}",
+            f"Mono of {[*PIXEL_BITS.values()]} bits, not padded",
+        )
 
 
 def open_camera(source: str) -> LiveCamera | GigeReceiver:

@@ -135,3 +135,29 @@ def place(page: Any) -> int:
         page.locator(".lab-wait").inner_text(),
     )
     return int(found[1] or 0) if found else -1
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_tabs_that_are_closed_while_they_wait_leave_the_log_clean(
+    browser: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Also those whose turn comes while the server still waits for their browsers to come back."""
+    with Server(tmp_path, "--workers", "1") as server:
+        with opened(browser, server.login, NARROW) as first:
+            waiting = [browser.new_page(viewport=NARROW) for _ in range(3)]
+            for page in waiting:
+                page.goto(server.login, wait_until="commit")
+                page.get_by_text("This page opens when another one").wait_for()
+            waiting.sort(key=place)
+            waiting[0].close()
+            waiting[1].close()
+            first.close()
+        # The last one opens when the others have gone.
+        waiting[2].set_default_timeout(QUICK_MS)
+        status(waiting[2], "solved")
+        waiting[2].wait_for_timeout(
+            12_000
+        )  # a script that is not answered ends after ten seconds
+        waiting[2].close()
+    assert "Traceback" not in capfd.readouterr().err
