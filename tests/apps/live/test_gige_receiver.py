@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import shutil
 import socket
 import struct
@@ -13,6 +14,7 @@ import time
 import zipfile
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,6 +27,9 @@ from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Array
 from tests.apps.live.test_gige import camera_of, live_flight, port  # noqa: F401
+from tests.helpers.labpage import CHROMIUM, NARROW, Server, opened, panel, pictured
+
+pytest_plugins = ["tests.helpers.labpage"]
 
 FAKE = "arv-fake-gv-camera-0.8"
 FAKE_SIZE = (512, 512)
@@ -57,7 +62,7 @@ class Holed(Recording):
 
 @contextlib.contextmanager
 def flying(kind: type[GigeCamera] = Recording, **more: str) -> Iterator[Any]:
-    """A camera in flight, with its address."""
+    """A camera in flight."""
     live = live_flight(speed=1.0, **more)
     live.warm_up()  # compiling takes longer than the receiver waits
     with camera_of(live, 0, kind) as camera:
@@ -330,6 +335,28 @@ def test_the_page_reads_it_like_its_other_sources() -> None:
         assert is_one_of(picture.pixels, camera.made, lambda dn: dn)
         source.close()
         assert camera.controller is None
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_the_page_compares_its_frames_with_the_simulation(
+    browser: Any, tmp_path: Path
+) -> None:
+    size = {"camera.width_px": "659", "camera.height_px": "493", "exposure.rate_hz": "4"}
+    with (
+        flying(**size, **{"exposure.time": "40 ms"}) as camera,
+        Server(tmp_path, "--camera", address(camera)) as server,
+        opened(browser, server.login, NARROW) as page,
+    ):
+        panel(page, "Image")
+        page.get_by_role("checkbox", name="as the scene's camera").click()
+        page.get_by_role("button", name="Watch").click()
+        page.get_by_text(re.compile("^camera: solved, [0-9]+ of [0-9]+ lights")).wait_for()
+        assert camera.controller
+        page.get_by_role("button", name="Stop").click()
+        page.get_by_role("button", name="Watch").wait_for()
+        assert camera.controller is None
+        pictured(page, "gige_camera")
 
 
 # Aravis' fake camera.
