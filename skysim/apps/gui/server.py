@@ -349,7 +349,7 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
             closed_pages.collect_soon()
 
         client.on_delete(close)
-        # A browser that has not connected, or has gone meanwhile, does not answer.
+        # A browser that has not connected, or hangs, does not answer.
         with suppress(TimeoutError):
             await client.connected(timeout=CONNECT_TIMEOUT_S)
             session = await pool.wait(

@@ -16,7 +16,6 @@ names in arvgvcpprivate.h.
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import io
 import re
@@ -28,6 +27,7 @@ import uuid
 import zipfile
 from collections import deque
 from collections.abc import Container, Iterator
+from contextlib import suppress
 from enum import IntEnum
 from typing import Any
 from urllib.parse import urlsplit
@@ -190,7 +190,7 @@ class GigeCamera(Sink):
         # Several cameras of a machine hear the same broadcast.
         self.broadcasts.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         # Not every system allows it, and 0.0.0.0 hears broadcasts by itself.
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             self.broadcasts.bind(("255.255.255.255", port))
         self.stream = udp_socket()
         self.stream.bind((self.host, 0))
@@ -416,7 +416,7 @@ class GigeCamera(Sink):
             # The sink's thread ends when the frames that wait are sent.
             while self.thread.is_alive():
                 # An answer to a client that has gone raises OSError.
-                with contextlib.suppress(OSError):
+                with suppress(OSError):
                     for ready in select.select(sockets, (), (), POLL_S)[0]:
                         datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
                         self.reply(datagram, sender, ready is self.broadcasts)
@@ -478,7 +478,7 @@ class GigeCamera(Sink):
         """Send packets to the receiver of the stream; it asks again for those that the network loses."""
         address = socket.inet_ntoa(self.memory[STREAM_ADDRESS : STREAM_ADDRESS + 4])
         for packet in packets:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 self.stream.sendto(packet, (address, self.value(STREAM_PORT)))
             if delay_s:
                 time.sleep(delay_s)
@@ -595,7 +595,7 @@ class GigeReceiver:
 
     def close(self) -> None:
         """Stop the acquisition, and give the control back."""
-        with self.control, self.stream, contextlib.suppress(InputError):
+        with self.control, self.stream, suppress(InputError):
             if self.stop:
                 self.write(*self.stop)
                 self.write(PRIVILEGE, 0)
@@ -608,7 +608,7 @@ class GigeReceiver:
         payload = struct.pack(f">{len(words)}I", *words)
         datagram = HEADER.pack(KEY, 1, command, len(payload), self.number) + payload
         for _ in range(TRIES):
-            with contextlib.suppress(OSError, struct.error):
+            with suppress(OSError, struct.error):
                 self.control.send(datagram)
                 answer = self.control.recv(MOST_DATAGRAM_BYTES)
                 status, answered, _, number = ANSWER.unpack_from(answer)
@@ -627,9 +627,10 @@ class GigeReceiver:
 
     def commands(self, *names: str) -> Iterator[tuple[int, int]]:
         """Register and value of commands, by the camera's GenICam file, which may be packed. Raises InputError."""
-        problem = f"no GenICam file in the camera that has plain registers for {names}"
         # A damaged file gives errors of many types.
-        with refusing(Exception, "", problem):
+        with refusing(
+            Exception, "", f"no GenICam file in it with plain registers for {names}"
+        ):
             ((at, size),) = re.findall(
                 rb"(?i)local:[^;]*;([\da-f]+);([\da-f]+)",
                 self.command(READMEM, XML_ADDRESS, READ_BYTES),

@@ -161,4 +161,5 @@ def test_a_tab_that_is_closed_while_it_waits_leaves_the_log_clean(
             12_000
         )  # a script that is not answered ends after ten seconds
         waiting[1].close()
-    assert "Traceback" not in capfd.readouterr().err
+    written = capfd.readouterr().err
+    assert "Traceback" not in written, written

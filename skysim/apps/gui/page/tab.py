@@ -286,8 +286,9 @@ class Tab(context.PageContext):
         self.use(session)
         self.new_session = new_session
         await self.arrangement.restore()
-        # The browser has just answered: without one there is no storage.
-        self.log_panel.keep(app.storage.tab)
+        # Without a browser there is no storage.
+        if ui.context.client.has_socket_connection:
+            self.log_panel.keep(app.storage.tab)
         await self.show_query(await self.history.read())
         refusal = self.message_text
         if self.is_open and self.view is None and await self.open(self.state.scene):
