@@ -512,7 +512,7 @@ def monochrome(image: Array) -> Array:
     return image[:, :, :3] @ LUMINANCE
 
 
-LIVE_SOURCES = "an index such as 0, a video file, a URL"
+LIVE_SOURCES = "an index such as 0, a video file, a URL, gige://HOST"
 
 
 class LiveCamera:
@@ -553,9 +553,3 @@ def video_numbers(path: Path) -> tuple[float, int]:
     if not (rate_hz > 0 and count > 0):
         raise InputError(path, "not a video that can be read", "AVI, MP4, MOV, MKV")
     return rate_hz, count
-
-
-def grab_frame(source: str) -> Array:
-    """One frame of a camera, (H, W) or (H, W, 3). Raises InputError if there is none."""
-    with closing(LiveCamera(source)) as camera:
-        return camera.frame()

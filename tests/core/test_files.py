@@ -11,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import warnings
+from contextlib import closing
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -520,12 +521,13 @@ def test_a_live_camera_s_frame_is_read_by_opencv_and_a_missing_one_is_reported(
     )
     video.write(frame)
     video.release()
-    grabbed = images.grab_frame(str(tmp_path / "camera.avi"))
+    with closing(images.LiveCamera(str(tmp_path / "camera.avi"))) as camera:
+        grabbed = camera.frame()
     assert grabbed.shape == frame.shape
     assert np.abs(grabbed.astype(int) - frame).max() < 30
     for nowhere in (str(tmp_path / "none.avi"), "99"):
         with pytest.raises(InputError, match="no camera found; allowed: an index such as 0"):
-            images.grab_frame(nowhere)
+            images.LiveCamera(nowhere).frame()
 
 
 def test_a_yaml_file_is_read_again_after_a_change_of_file_or_values(

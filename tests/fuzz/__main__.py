@@ -49,6 +49,8 @@ TARGETS = {
     "commands": (),
     "poses": (),
     "datagrams": (),
+    "gvsp": (),
+    "genicam": (),
     "quantities": (),
 }
 NAMES = tuple(TARGETS)

@@ -446,6 +446,8 @@ WIRE = (
     "commands",
     "poses",
     "datagrams",
+    "gvsp",
+    "genicam",
 )  # targets without a command
 # Commands with an option that takes a value.
 OPTIONS = (
@@ -692,7 +694,9 @@ def make_case(name: str, number: int, seed: int) -> Case:
     if name == "wire":
         target = rng.choice(WIRE)
         seeds = [path.read_bytes() for path in sorted((CORPUS / target).iterdir())]
-        kinds = mutations.BINARY if target in ("packets", "datagrams") else mutations.JSON
+        kinds = (
+            mutations.BINARY if target in ("packets", "datagrams", "gvsp") else mutations.JSON
+        )
         mutant = chosen(kinds, rng.choice(seeds), rng)
         return Case(
             (), mutant._replace(data=mutant.data or b"", is_wrong=False), target=target

@@ -286,6 +286,31 @@ def datagrams(data: bytes) -> None:
         camera.close()
 
 
+def gvsp(data: bytes) -> None:
+    """Packets that anyone sends to the receiver of a camera, each after its length in two bytes."""
+    receiver = gige.GigeReceiver("gige://127.0.0.1")
+    sent = 0
+    with receiver.control, receiver.stream:
+        while sent < len(data):
+            end = sent + 2 + int.from_bytes(data[sent : sent + 2])
+            packet = data[sent + 2 : end]
+            rejects(lambda packet=packet: receiver.take(packet), InputError)
+            sent = end
+            if len(receiver.parts) > gige.MOST_PACKETS:
+                raise AssertionError("more packets are kept than a frame has")
+
+
+def genicam(data: bytes) -> None:
+    """A GenICam file of any camera: its registers are found, or it is refused."""
+    receiver = gige.GigeReceiver("gige://127.0.0.1")
+    place = b"Local:camera.xml;%X;%X" % (gige.XML, len(data))
+    memory = {gige.XML_ADDRESS: place.ljust(gige.READ_BYTES, b"\0")}
+    memory |= {gige.XML + at: data[at : at + 512] for at in range(0, len(data), 512)}
+    receiver.command = lambda _, at, *size: b"addr" + memory[at]  # type: ignore[method-assign]
+    with receiver.control, receiver.stream:
+        rejects(lambda: list(receiver.commands("AcquisitionStart")), InputError)
+
+
 @cache
 def commanded_flight() -> CommandState:
     """A flight that takes every kind of command."""
@@ -335,6 +360,8 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
         commands,
         poses,
         datagrams,
+        gvsp,
+        genicam,
         quantities,
     )
 }

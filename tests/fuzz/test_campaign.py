@@ -140,8 +140,11 @@ def test_a_damaged_film_prints_nothing(
     capfd.readouterr()
     for at in range(8, 400, 4):
         path.write_bytes(whole[:at] + b"zzzz" + whole[at + 4 :])
-        with contextlib.suppress(InputError):
-            images.grab_frame(str(path))
+        with (
+            contextlib.suppress(InputError),
+            contextlib.closing(images.LiveCamera(str(path))) as film_camera,
+        ):
+            film_camera.frame()
     assert capfd.readouterr().err == ""
 
 

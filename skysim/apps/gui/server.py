@@ -8,6 +8,7 @@ import secrets
 import signal
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from posixpath import normpath
@@ -348,16 +349,14 @@ def routes(scene: str, folder: Path, out: Path, cameras: Sequence[str], workers:
             closed_pages.collect_soon()
 
         client.on_delete(close)
-        try:
+        # A browser that has not connected, or hangs, does not answer.
+        with suppress(TimeoutError):
             await client.connected(timeout=CONNECT_TIMEOUT_S)
-        except TimeoutError:  # no browser has connected: start no worker
-            return
-        session = await pool.wait(
-            lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED)
-        )
-        if session is None:  # the tab was closed while it waited
-            return
-        await tab.start(session, pool.take)
+            session = await pool.wait(
+                lambda: tab.is_open, lambda text: tab.sensor.show_waiting(text, QUEUED)
+            )
+            if session:
+                await tab.start(session, pool.take)
 
 
 def serve(

@@ -1,8 +1,8 @@
-"""A GigE Vision camera: control by GVCP, frames by GVSP, and a GenICam file that tells clients what it can do.
+"""GigE Vision, control by GVCP and frames by GVSP: a camera, and the application that receives one's frames.
 
-The features are those of data/gige_camera.xml. A frame (a "block") is a leader, packets with its pixels row by row,
-and a trailer, numbered from 0; the newest are kept, so that a client can have lost packets sent again. Its timestamp
-is the clock of the simulator at mid-exposure, in nanoseconds.
+A GenICam file tells applications what a camera can do; the simulated one's is data/gige_camera.xml. A frame (a
+"block") is a leader, packets with its pixels row by row, and a trailer, numbered from 0; the newest are kept, so that
+a client can have lost packets sent again. Its timestamp is the clock of the simulator at mid-exposure, in nanoseconds.
 
 Pixels are little-endian. Mono16 holds the detector's numbers. Mono8 and Mono12 hold DN >> (bits - n), the highest n
 bits of a detector with more; the numbers of one with fewer bits are sent as they are.
@@ -16,23 +16,32 @@ names in arvgvcpprivate.h.
 
 from __future__ import annotations
 
-import contextlib
 import functools
+import io
+import re
 import select
 import socket
 import struct
 import time
 import uuid
+import zipfile
 from collections import deque
-from collections.abc import Container
+from collections.abc import Container, Iterator
+from contextlib import suppress
 from enum import IntEnum
 from typing import Any
+from urllib.parse import urlsplit
+from xml.etree import ElementTree
+
+import numpy as np
 
 from skysim.apps.live.pacing import Live
 from skysim.apps.live.packets import Packet, Sink, start_thread
 from skysim.core import __version__
-from skysim.core.errors import InputError, reason
+from skysim.core.errors import InputError, errors_within, reason, refusing
+from skysim.core.images import LiveCamera
 from skysim.core.paths import DATA
+from skysim.core.types import Array
 
 # Control.
 
@@ -54,6 +63,7 @@ SILENT = (FORCEIP, PACKETRESEND)  # have no answer; the address is that of the m
 
 # Registers that the protocol itself needs.
 DISCOVERY_BYTES = 0xF8
+XML_ADDRESS = 0x0200  # text of 512 bytes
 HEARTBEAT = 0x0938  # ms
 PRIVILEGE = 0x0A00
 EXCLUSIVE = 1
@@ -127,11 +137,17 @@ RANGES = (
     (0xA000, 0xA04C),
     (XML, XML + XML_BYTES),
 )
+PACKET_BYTES = 1500  # of Ethernet without jumbo frames
 HEADER_BYTES = 36  # of IP, UDP and GVSP in a packet
+# Status and number of the block; kind and number of the packet, in 8 and 24 bits.
+PACKET_HEAD = struct.Struct(">HHI")
+# Type of payload, timestamp, pixel format, width, height; offsets; padding.
+LEADER_BODY = struct.Struct(">IQIII8xI")
 LEADER = 1
 TRAILER = 2
 PIXELS = 3
 IMAGE = 1  # type of payload
+NUMBER = 0xFFFFFF  # bits of a packet's number
 MOST_BLOCKS = 4  # that are kept
 POLL_S = 0.1
 
@@ -174,7 +190,7 @@ class GigeCamera(Sink):
         # Several cameras of a machine hear the same broadcast.
         self.broadcasts.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         # Not every system allows it, and 0.0.0.0 hears broadcasts by itself.
-        with contextlib.suppress(OSError):
+        with suppress(OSError):
             self.broadcasts.bind(("255.255.255.255", port))
         self.stream = udp_socket()
         self.stream.bind((self.host, 0))
@@ -197,7 +213,6 @@ class GigeCamera(Sink):
         """Set the registers to their first values."""
         camera = self.scene.camera
         detector = camera.detector
-        celsius = detector.temperature_c
         serial = uuid.getnode()
         for address, value in {
             0x0000: struct.pack(
@@ -215,13 +230,13 @@ class GigeCamera(Sink):
                 b"%012x" % serial,
                 self.scene.name.encode(),
             ),
-            0x0200: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
+            XML_ADDRESS: b"Local:gige_camera.xml;%X;%X" % (XML, XML_BYTES),
             0x0600: 1,  # network interface
             0x0904: 1,  # stream channel
             0x0934: 0xC0000007,  # name, serial number; resend, WRITEMEM, several registers in a command
             HEARTBEAT: 3000,
             0x0940: 1_000_000_000,  # ticks of the clock a second
-            PACKET_SIZE: 1500,
+            PACKET_SIZE: PACKET_BYTES,
             0x0D1C: self.stream.getsockname()[1],
             0xA000: camera.width_px,
             0xA004: camera.height_px,
@@ -229,7 +244,7 @@ class GigeCamera(Sink):
             # Whole microseconds: the longest exposure must not be refused for its rounding.
             LONGEST_US: 1e6 * self.live.commands.longest_exposure_s // 1,
             0xA020: 1 / detector.gain_e_dn,
-            CELSIUS: detector.dark_temperature_c if celsius is None else celsius,
+            CELSIUS: detector.own_c,
             0xA030: self.scene.exposure.rate_hz,
             XML: (DATA / "gige_camera.xml").read_bytes().ljust(XML_BYTES, b"\n"),
         }.items():
@@ -328,7 +343,7 @@ class GigeCamera(Sink):
             return self.read(0, DISCOVERY_BYTES)
         if command == PACKETRESEND:
             block, first, last = struct.unpack(">2xHII", payload)
-            self.resend(block, first & 0xFFFFFF, last & 0xFFFFFF)
+            self.resend(block, first & NUMBER, last & NUMBER)
             return b""
         if sender != self.controller and self.value(PRIVILEGE) & EXCLUSIVE:
             raise RefusedError(GvcpStatus.ACCESS_DENIED)
@@ -348,8 +363,7 @@ class GigeCamera(Sink):
 
     def refresh(self) -> None:
         """Update the registers whose values change."""
-        # The second byte of a format is the number of bits that a pixel takes.
-        pixel_bytes = self.memory[PIXEL_FORMAT + 1] // 8
+        pixel_bytes = pixel_type(self.value(PIXEL_FORMAT)).itemsize
         self.put(PAYLOAD_BYTES, self.value(0xA000) * self.value(0xA004) * pixel_bytes)
         # While commands wait for the flight, the registers hold what was commanded.
         if not self.live.inbox.waiting:
@@ -402,7 +416,7 @@ class GigeCamera(Sink):
             # The sink's thread ends when the frames that wait are sent.
             while self.thread.is_alive():
                 # An answer to a client that has gone raises OSError.
-                with contextlib.suppress(OSError):
+                with suppress(OSError):
                     for ready in select.select(sockets, (), (), POLL_S)[0]:
                         datagram, sender = ready.recvfrom(MOST_DATAGRAM_BYTES)
                         self.reply(datagram, sender, ready is self.broadcasts)
@@ -446,18 +460,17 @@ class GigeCamera(Sink):
         pixel_format = self.value(PIXEL_FORMAT)
         bits = PIXEL_BITS[pixel_format]
         pixels = packet.pixels >> max(self.scene.camera.detector.bits - bits, 0)
-        data = pixels.astype("<u1" if bits == 8 else "<u2").tobytes()
+        data = pixels.astype(pixel_type(pixel_format)).tobytes()
         height, width = pixels.shape
         t_ns = round(1e9 * packet.header["t_s"])
         size = self.value(PACKET_SIZE) - HEADER_BYTES
         parts = [
-            # No offset and no padding.
-            (LEADER, struct.pack(">IQIII12x", IMAGE, t_ns, pixel_format, width, height)),
+            (LEADER, LEADER_BODY.pack(IMAGE, t_ns, pixel_format, width, height, 0)),
             *((PIXELS, data[at : at + size]) for at in range(0, len(data), size)),
             (TRAILER, struct.pack(">II", IMAGE, height)),
         ]
         return [
-            struct.pack(">II", self.block, kind << 24 | number) + part
+            PACKET_HEAD.pack(0, self.block, kind << 24 | number) + part
             for number, (kind, part) in enumerate(parts)
         ]
 
@@ -465,7 +478,7 @@ class GigeCamera(Sink):
         """Send packets to the receiver of the stream; it asks again for those that the network loses."""
         address = socket.inet_ntoa(self.memory[STREAM_ADDRESS : STREAM_ADDRESS + 4])
         for packet in packets:
-            with contextlib.suppress(OSError):
+            with suppress(OSError):
                 self.stream.sendto(packet, (address, self.value(STREAM_PORT)))
             if delay_s:
                 time.sleep(delay_s)
@@ -478,3 +491,203 @@ class GigeCamera(Sink):
 def udp_socket() -> socket.socket:
     """A socket for datagrams."""
     return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+
+def pixel_type(pixel_format: int) -> np.dtype:
+    """Type of a pixel: the second byte of a format is the number of bits that it takes."""
+    return np.dtype(f"<u{(pixel_format >> 16 & 0xFF) // 8}")
+
+
+# The application: receives the frames of a camera.
+
+SCHEME = "gige://"
+TRIES = 8  # for an answer; one to an earlier try is none
+ANSWER_S = 0.3
+PATIENCE_S = 10.0  # for a whole frame
+MOST_PACKETS = 1 << 17  # of a frame: 96 million pixels of 16 bits
+MOST_XML_BYTES = 1 << 24
+READ_BYTES = 512
+FREE = "a camera that no other application controls (status 0x8006)"
+BUFFER_BYTES = 1 << 23  # of packets that wait; the system may allow less
+
+
+class GigeReceiver:
+    """The application that controls a camera and takes its frames. The interface is that of `LiveCamera`.
+
+    Parameters
+    ----------
+    source
+        gige://HOST or gige://HOST:PORT
+
+    Attributes
+    ----------
+    stop
+        Register that ends the acquisition, and the value for it; None before the acquisition has begun
+    block, parts
+        Number of the frame that comes, and its packets so far, without their heads
+
+    Raises
+    ------
+    InputError
+        For what is no address.
+    """
+
+    stop: tuple[int, int] | None = None
+    number = 0
+    block = 0
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.parts: list[bytes] = []
+        self.control = udp_socket()
+        self.control.settimeout(ANSWER_S)
+        self.stream = udp_socket()
+        self.stream.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+        # Without a host, for one that is not known, and a port that is none.
+        with refusing((TypeError, OSError, ValueError), source, "no such address"):
+            place = urlsplit(source)
+            self.control.connect((place.hostname, place.port or GVCP_PORT))
+            self.stream.bind((self.control.getsockname()[0], 0))
+
+    def frame(self) -> Array:
+        """The next whole frame, (H, W).
+
+        1. Forget the packets that have come before: they are of old frames.
+        2. Take the control, or keep it. A camera takes it from an application that it does not hear for some seconds,
+           and closes the stream: then open it again, and start.
+        3. Take the packets that come. A frame with a hole is not given.
+
+        Raises
+        ------
+        InputError
+            For a camera that does not answer, is controlled by another application, has no plain registers to start
+            by, sends another kind of frames than `GigeCamera`, or none.
+        """
+        with errors_within(self.source):
+            # 1. Old packets.
+            end_s = time.monotonic() + PATIENCE_S
+            while select.select([self.stream], (), (), 0)[0] and time.monotonic() < end_s:
+                self.stream.recv(PACKET_BYTES)
+            # 2. Control.
+            self.write(PRIVILEGE, CONTROL)
+            here, port = self.stream.getsockname()
+            if self.command(READREG, STREAM_PORT)[2:] != port.to_bytes(2):
+                start, self.stop = self.commands("AcquisitionStart", "AcquisitionStop")
+                self.write(PACKET_SIZE, PACKET_BYTES)
+                self.write(STREAM_ADDRESS, int.from_bytes(socket.inet_aton(here)))
+                self.write(STREAM_PORT, port)
+                self.write(*start)
+            # 3. Packets.
+            host, _ = self.control.getpeername()
+            while time.monotonic() < end_s:
+                if not select.select([self.stream], (), (), POLL_S)[0]:
+                    self.write(PRIVILEGE, CONTROL)
+                    continue
+                packet, (sender, _) = self.stream.recvfrom(PACKET_BYTES)
+                image = self.take(packet) if sender == host else None
+                if image is not None:
+                    return image
+            raise InputError(
+                "",
+                f"no whole frame in {PATIENCE_S:g} s",
+                "a camera whose trigger mode is off",
+            )
+
+    def close(self) -> None:
+        """Stop the acquisition, and give the control back."""
+        with self.control, self.stream, suppress(InputError):
+            if self.stop:
+                self.write(*self.stop)
+                self.write(PRIVILEGE, 0)
+
+    # Control
+
+    def command(self, command: int, *words: int) -> bytes:
+        """Give a command of these words until it is answered; return the answer's data. Raises InputError."""
+        self.number = self.number % 0xFFFF + 1
+        payload = struct.pack(f">{len(words)}I", *words)
+        datagram = HEADER.pack(KEY, 1, command, len(payload), self.number) + payload
+        for _ in range(TRIES):
+            with suppress(OSError, struct.error):
+                self.control.send(datagram)
+                answer = self.control.recv(MOST_DATAGRAM_BYTES)
+                status, answered, _, number = ANSWER.unpack_from(answer)
+                if (answered, number) != (command + 1, self.number):
+                    continue
+                if status:
+                    raise InputError(
+                        "", f"answers {command:#06x} by status {status:#06x}", FREE
+                    )
+                return answer[ANSWER.size :]
+        raise InputError("", "no GigE Vision camera answers", FREE)
+
+    def write(self, address: int, value: int) -> None:
+        """Write a register of 4 bytes. Raises InputError."""
+        self.command(WRITEREG, address, value)
+
+    def commands(self, *names: str) -> Iterator[tuple[int, int]]:
+        """Register and value of commands, by the camera's GenICam file, which may be packed. Raises InputError."""
+        # A damaged file gives errors of many types.
+        with refusing(
+            Exception, "", f"no GenICam file in it with plain registers for {names}"
+        ):
+            ((at, size),) = re.findall(
+                rb"(?i)local:[^;]*;([\da-f]+);([\da-f]+)",
+                self.command(READMEM, XML_ADDRESS, READ_BYTES),
+            )
+            first = int(at, 16)
+            end = first + min(int(size, 16), MOST_XML_BYTES)
+            # Registers have 4 bytes.
+            data = b"".join(
+                self.command(READMEM, at, min(READ_BYTES, end - at + -end % 4))[4:]
+                for at in range(first, end, READ_BYTES)
+            )[: end - first]
+            if data.startswith(b"PK"):
+                packed = zipfile.ZipFile(io.BytesIO(data))
+                data = packed.open(packed.namelist()[0]).read(MOST_XML_BYTES)
+            root: Any = ElementTree.fromstring(data.strip(b"\0\n"))
+            for name in names:
+                command = root.find(f".//{{*}}Command[@Name='{name}']")
+                value = int(command.findtext("{*}CommandValue"), 0)
+                node = root.find(f".//{{*}}IntReg[@Name='{command.findtext('{*}pValue')}']")
+                # Its address must be a number, to which nothing is added.
+                (address,) = (one.text for one in node if re.search("Addr|Ind|Kni", one.tag))
+                yield int(address, 0), value
+
+    # Frames
+
+    def take(self, packet: bytes) -> Array | None:
+        """Take a packet, of anyone; return the frame that it completes. A packet that is lost ends its frame.
+
+        Raises
+        ------
+        InputError
+            For a frame of another kind than `GigeCamera` sends.
+        """
+        try:
+            _, number, word = PACKET_HEAD.unpack_from(packet)
+            if word == LEADER << 24:
+                self.block = number
+                self.parts.clear()
+            if number != self.block or not word & NUMBER == len(self.parts) < MOST_PACKETS:
+                return None
+            self.parts.append(packet[PACKET_HEAD.size :])
+            if word >> 24 != TRAILER:
+                return None
+            leader, *pixels, _ = self.parts
+            kind, _, code, width, height, padding = LEADER_BODY.unpack_from(leader)
+            if kind == IMAGE and code in PIXEL_BITS and not padding:
+                data = b"".join(pixels)
+                return np.frombuffer(data, pixel_type(code)).reshape(height, width)
+        except (ValueError, struct.error):
+            return None
+        raise InputError(
+            "",
+            f"sends payload {kind:#x} in pixel format {code:#010x}",
+            f"Mono of {[*PIXEL_BITS.values()]} bits, not padded",
+        )
+
+
+def open_camera(source: str) -> LiveCamera | GigeReceiver:
+    """The camera at gige://HOST, or a device, a video file or an address. Raises InputError."""
+    return GigeReceiver(source) if source.startswith(SCHEME) else LiveCamera(source)

@@ -186,9 +186,6 @@ def properties(scene: Scene) -> list[Any]:
     """The standard properties of an INDI camera, https://docs.indilib.org/drivers/standard-properties."""
     camera = scene.camera
     detector = camera.detector
-    celsius = detector.temperature_c
-    if celsius is None:
-        celsius = detector.dark_temperature_c
     pixel_um = 1e6 * camera.pixel_m
     numbers: dict[str, dict[str, float]] = {
         EXPOSURE: {SECONDS: 0},
@@ -202,7 +199,7 @@ def properties(scene: Scene) -> list[Any]:
         },
         "CCD_FRAME": {"X": 0, "Y": 0, "WIDTH": camera.width_px, "HEIGHT": camera.height_px},
         "CCD_BINNING": {"HOR_BIN": 1, "VER_BIN": 1},
-        "CCD_TEMPERATURE": {"CCD_TEMPERATURE_VALUE": celsius},
+        "CCD_TEMPERATURE": {"CCD_TEMPERATURE_VALUE": detector.own_c},
     }
     driver = [
         TextMember("DRIVER_NAME", membervalue=DEVICE),

@@ -208,22 +208,23 @@ class PlannedFrame(NamedTuple):
 
 def shots(config: DetectorConfig) -> Iterator[PlannedFrame]:
     """Darks at three exposures and two temperatures, flats in pairs from 2 to 150 % of the full well."""
-    own_c = (
-        config.dark_temperature_c if config.temperature_c is None else config.temperature_c
-    )
     own_e_s = config.dark_e_s * 2.0**config.doublings
     wanted_e = min(
         max(DARK_NOISES * config.read_noise_e**2, LEAST_DARK_E), capacity_e(config) / 16
     )
     longest_s = float(f"{wanted_e / own_e_s:.2g}") if own_e_s > 0 else 10.0
-    for temperature_c in (own_c, own_c + WARMER_C):
+    for temperature_c in (config.own_c, config.own_c + WARMER_C):
         for part in DARK_PARTS:
             yield PlannedFrame(
                 "darks", float(f"{part * longest_s:.3g}"), temperature_c, 0.0, DARKS
             )
     for part in FLAT_PARTS:
         yield PlannedFrame(
-            "flats", float(f"{part * FLAT_S:.3g}"), own_c, capacity_e(config) / FLAT_S, PAIR
+            "flats",
+            float(f"{part * FLAT_S:.3g}"),
+            config.own_c,
+            capacity_e(config) / FLAT_S,
+            PAIR,
         )
 
 

@@ -477,11 +477,15 @@ class DetectorConfig(ConfigModel):
     noise: bool = True
 
     @property
+    def own_c(self) -> float:
+        """Temperature of the detector, degrees Celsius."""
+        set_c = self.temperature_c
+        return self.dark_temperature_c if set_c is None else set_c
+
+    @property
     def doublings(self) -> float:
         """Number of times that the dark current doubles from dark_temperature_c to temperature_c."""
-        if self.temperature_c is None:
-            return 0.0
-        return (self.temperature_c - self.dark_temperature_c) / self.dark_doubling_c
+        return (self.own_c - self.dark_temperature_c) / self.dark_doubling_c
 
     def check(self) -> None:
         if isinstance(self.quantum_efficiency, ColorEfficiencyConfig) != bool(self.bayer):

@@ -24,6 +24,7 @@ from tests.helpers.labpage import (
 
 pytest.importorskip("nicegui", reason="the extra `gui` is not installed")
 
+from skysim.apps.gui.server import RECONNECT_S
 from skysim.apps.gui.worker import session
 
 pytest_plugins = ["tests.helpers.labpage"]
@@ -135,3 +136,30 @@ def place(page: Any) -> int:
         page.locator(".lab-wait").inner_text(),
     )
     return int(found[1] or 0) if found else -1
+
+
+@pytest.mark.browser
+@pytest.mark.skipif(not CHROMIUM, reason="Chromium is not installed")
+def test_a_tab_that_is_closed_while_it_waits_leaves_the_log_clean(
+    browser: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its turn comes after its browser has gone, while the server still waits for the browser to come back."""
+    with Server(tmp_path, "--workers", "1") as server:
+        with opened(browser, server.login, NARROW) as first:
+            waiting = [browser.new_page(viewport=NARROW) for _ in range(2)]
+            for page in waiting:
+                page.goto(server.login, wait_until="commit")
+                page.get_by_text("This page opens when another one").wait_for()
+            waiting.sort(key=place)
+            first.close()
+            waiting[1].wait_for_timeout(1000 * (RECONNECT_S - 1.5))
+            waiting[0].close()
+        # The other one opens when both have gone.
+        waiting[1].set_default_timeout(QUICK_MS)
+        status(waiting[1], "solved")
+        waiting[1].wait_for_timeout(
+            12_000
+        )  # a script that is not answered ends after ten seconds
+        waiting[1].close()
+    written = capfd.readouterr().err
+    assert "Traceback" not in written, written

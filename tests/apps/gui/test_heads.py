@@ -113,6 +113,29 @@ def test_a_camera_is_chosen_and_is_in_the_address(browser: Any, server: Server) 
 
 @pytest.mark.browser
 @in_browser
+@pytest.mark.parametrize(
+    ("query", "told"),
+    [
+        ("scene=two_heads&head=nose", "two_heads has no camera 'nose'; allowed: main, side"),
+        ("scene=shefex2&study=none_such", "study 'none_such' is not in the folder"),
+        ("scene=shefex2&view=replay&study=nope&trial=3", "study 'nope' is not in the folder"),
+        ("scene=shefex2&set=camera.fov=3", "camera.fov: unknown key; allowed: "),
+        ("scene=shefex2&at=1e300,0,0", "allowed: 0 to 360"),
+        ("scene=shefex2&at=1,2", "three angles"),
+        ("scene=shefex2&trial=x", "at, t, trial; allowed: numbers"),
+    ],
+)
+def test_an_address_with_a_wrong_value_says_so(
+    browser: Any, server: Server, query: str, told: str
+) -> None:
+    """The page shows what it can of the address, and no key of it is dropped without a word."""
+    with opened(browser, server.login, NARROW) as page:
+        page.goto(f"{server.url}?{query}")
+        page.get_by_role("status").filter(has_text=told).wait_for()
+
+
+@pytest.mark.browser
+@in_browser
 def test_key_1_reads_the_codes_until_the_leds_are_named(browser: Any, server: Server) -> None:
     with opened(browser, f"{server.login}", NARROW) as page:
         page.goto(f"{server.url}?scene=coded_spiral")

@@ -339,7 +339,7 @@ def gui(
     out
         Folder of studies and their reports.
     camera : SOURCE
-        Camera that the page may watch: index, folder of images, video file or address; repeatable.
+        Camera that the page may watch: index, folder of images, video file, address or gige://HOST; repeatable.
     workers
         Most worker processes, one for each page; further pages wait.
     show

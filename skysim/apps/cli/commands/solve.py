@@ -78,7 +78,7 @@ def solve(
     map_
         Map of the dome by `skysim survey`; default: the scene's LEDs.
     live
-        Also solve a frame of a live camera: its index, a video file or an address.
+        Also solve a frame of a live camera: its index, a video file, an address or gige://HOST.
     time
         UTC at which the images were taken, 1900 to 2100, e.g. 2012-06-22T21:00:00.
     catalog
@@ -177,13 +177,15 @@ def numbers(name: str, text: str | None, separator: str, count: int, kind: Any) 
 def pictures(images: list[Path], live: str | None, out: Path, sequence: bool) -> list[Path]:
     """The files to solve, with a frame of the live camera, which is written to `out`. Raises InputError without any."""
     from skysim.apps import plate_solver
+    from skysim.apps.live.gige import open_camera
     from skysim.core import files
-    from skysim.core.images import grab_frame, stem_of
+    from skysim.core.images import stem_of
 
     paths = plate_solver.pictures_in(images)
     if live is not None:
         paths.append(out / "live.png")
-        files.write_image(paths[-1], grab_frame(live))
+        with closing(open_camera(live)) as camera:
+            files.write_image(paths[-1], camera.frame())
     if not paths:
         raise InputError("", "no images", "files, folders, or --live CAMERA")
     if sequence:  # a frame that is there as FITS and as PNG is one

@@ -68,7 +68,7 @@ class Palette:
             self.field = ui.input(placeholder="type an action", on_change=self.filter)
             self.field.props('dense borderless autofocus aria-label="Action"').classes(
                 "w-full"
-            ).mark("palette")
+            )
             self.field.on("keydown.down.prevent", lambda: self.choose(self.chosen + 1))
             self.field.on("keydown.up.prevent", lambda: self.choose(self.chosen - 1))
             self.field.on("keydown.enter.prevent", self.enter)

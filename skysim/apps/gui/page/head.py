@@ -32,29 +32,21 @@ class Head:
                 value=page.state.scene,
                 on_change=self.scene_picked,
             )
-            self.picker.props('aria-label="Scene"').classes("lab-scene").mark("scene")
+            self.picker.props('aria-label="Scene"').classes("lab-scene")
             self.camera = widgets.select([], "borderless", on_change=self.camera_picked)
-            self.camera.props('aria-label="Camera"').mark("camera")
-            self.banner = (
-                widgets.LiveText(page.contents, "live").classes("lab-banner").mark("banner")
-            )
-            self.live_button = widgets.button("Live", self.go_live, "live")
+            self.camera.props('aria-label="Camera"')
+            self.banner = widgets.LiveText(page.contents, "live").classes("lab-banner")
+            self.live_button = widgets.button("Live", self.go_live)
             self.live_button.set_visibility(False)
-            page.message = (
-                ui.label().classes("lab-said").props('role="status"').mark("message")
-            )
-            page.busy = (
-                ui.icon("hourglass_empty", size="16px").classes("lab-busy").mark("busy")
-            )
-            page.latency = (
-                widgets.LiveText(page.contents).classes("lab-rate mono quiet").mark("rate")
-            )
+            page.message = ui.label().classes("lab-said").props('role="status"')
+            page.busy = ui.icon("hourglass_empty", size="16px").classes("lab-busy")
+            page.latency = widgets.LiveText(page.contents).classes("lab-rate mono quiet")
             page.latency.props('title="latency: from the request for a frame to its arrival"')
             self.noise = ui.switch("noise", value=True, on_change=self.switch_noise).props(
                 f'dense size=xs title="{NOISE}"'
             )
             page.identifying = ui.switch("identify", value=True).props("dense size=xs")
-            with ui.button("Export").props("dense flat size=sm").mark("export"), ui.menu():
+            with ui.button("Export").props("dense flat size=sm"), ui.menu():
                 for name in photo.FILE_BY_ITEM:
                     item = ui.menu_item(name, on_click=lambda name=name: self.export(name))
                     item.props("dense").style("white-space: nowrap")

@@ -67,35 +67,31 @@ class MonteCarloPanel:
             self.study_select = (
                 widgets.select({}).props('aria-label="Study"').classes("flex-grow")
             )
-            self.study_select.mark("study").on_value_change(self.study_chosen)
-            self.button = widgets.button("Start", self.start_or_stop, "monte-carlo")
-            self.report = widgets.button("Report", self.open_report, "report")
+            self.study_select.on_value_change(self.study_chosen)
+            self.button = widgets.button("Start", self.start_or_stop)
+            self.report = widgets.button("Report", self.open_report)
         with widgets.div("lab-trial") as self.fields:
             self.count = widgets.number(
                 "runs, F8", value=200, min=1, max=100_000, precision=0
             )
-            self.count.mark("runs")
             self.kind = widgets.select(TRIAL_KINDS, value="centroids", label="of")
             self.kind.tooltip(MODEL)
             self.noise = widgets.number("noise, px", value=0.1, min=0, max=10, step=0.05)
             self.noise.on_value_change(self.show_noise)
             self.magnitude = widgets.number("noise, mag", value=0.25, min=0, max=5, step=0.05)
             self.false_lights = widgets.number("false", value=0, min=0, max=100, precision=0)
-            self.field = widgets.number("field, °", min=1, max=90).mark("field")
+            self.field = widgets.number("field, °", min=1, max=90)
             self.field.on("keydown.enter", self.set_field_of_view)
         with widgets.row(3) as self.model:
-            self.with_noise = widgets.checkbox("with noise", value=True).mark("with-noise")
+            self.with_noise = widgets.checkbox("with noise", value=True)
             self.arcsec = widgets.number("noise, ″ an axis", min=0, step=1)
             self.arcsec.on("blur", self.angle_typed).on("keydown.enter", self.angle_typed)
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
             "instant-feedback"
         )
         self.note = widgets.quiet(NO_STUDY).style("margin-top: 6px")
-        self.note.mark("trials-note")
-        self.chart = (
-            ui.echart(options()).classes("w-full").style("height: 190px").mark("histogram")
-        )
-        self.table = widgets.div("mono w-full").mark("figures")
+        self.chart = ui.echart(options()).classes("w-full").style("height: 190px")
+        self.table = widgets.div("mono w-full")
         self.failures = ui.column().classes("w-full gap-1")
         ui.separator().style("margin: 8px 0")
         widgets.quiet("Finished studies")
@@ -286,6 +282,8 @@ class MonteCarloPanel:
         is_here = name and folder.parent == self.page.out and is_shown(name, self.page.user)
         found = await run.io_bound(stored_study, folder) if is_here else None
         if found is None:
+            if name:
+                self.page.show_message(f"study {name!r} is not in the folder of this page")
             self.page.set_state(study="")
             return
         self.process = StudyProcess(folder)

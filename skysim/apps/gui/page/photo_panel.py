@@ -50,7 +50,7 @@ class PhotoPanel:
         self.live = False
         self.logged = ""
         self.fov = ui.number("field of view, deg (empty: 2 to 100 are tried)", min=1, max=120)
-        self.fov.props("dense outlined clearable").classes("w-full").mark("fov")
+        self.fov.props("dense outlined clearable").classes("w-full")
         self.upload = ui.upload(
             label="Drop a FITS, PNG, JPEG, TIFF or BMP here",
             auto_upload=True,
@@ -61,12 +61,11 @@ class PhotoPanel:
         self.upload.props(f'flat bordered accept="{",".join(SUFFIXES)}"').classes(
             "w-full"
         ).style("margin: 10px 0")
-        self.upload.mark("upload")
         with widgets.row():
             self.source = widgets.select(
                 list(cameras), label="live camera", value=next(iter(cameras), None)
             ).classes("flex-grow min-w-0")
-            self.button = widgets.button("Watch", self.watch, "camera")
+            self.button = widgets.button("Watch", self.watch)
             if not cameras:
                 self.source.set_visibility(False)
                 self.button.set_visibility(False)
@@ -78,7 +77,7 @@ class PhotoPanel:
         self.result_text = ui.label(NO_IMAGE)
         self.result_text.classes("mono quiet").style(
             "margin-top: 10px; white-space: pre-wrap"
-        ).mark("facts")
+        )
         page.derive(lambda view: view.image, partial(self.show_text, NO_IMAGE, "quiet"))
 
     def rejected(self, _: Any) -> None:

@@ -62,14 +62,14 @@ class CheckPanel:
         self.page = page
         self.scene_3d = scene_3d
         with widgets.row():
-            widgets.button("Check", self.check, "check")
-        self.facts = ui.column().classes("w-full gap-1").mark("check-result")
+            widgets.button("Check", self.check)
+        self.facts = ui.column().classes("w-full gap-1")
         with widgets.row().style("margin-top: 8px"):
-            widgets.button("Map", self.map, "map")
-        self.fields = ui.column().classes("w-full gap-1").mark("map-result")
+            widgets.button("Map", self.map)
+        self.fields = ui.column().classes("w-full gap-1")
         with widgets.row().style("margin-top: 8px"):
-            self.cover_button = widgets.button(COVERAGE, self.cover, "cover")
-        self.coverage = CoverageMap().on("point", self.point).mark("coverage")
+            self.cover_button = widgets.button(COVERAGE, self.cover)
+        self.coverage = CoverageMap().on("point", self.point)
         self.empty()
         page.derive(lambda view: view.opened, self.empty)
 
@@ -194,7 +194,7 @@ class SurveyPanel:
             self.save_map = self.button(
                 "Map file", self.download_map, "save the LEDs for tracker.map"
             )
-        self.stops = ui.column().classes("w-full gap-1").mark("survey-result")
+        self.stops = ui.column().classes("w-full gap-1")
         self.set_scene()
         page.derive(lambda view: view.opened, self.set_scene)
 

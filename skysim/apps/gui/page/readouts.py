@@ -43,7 +43,7 @@ class AttitudeCard:
                 widgets.quiet("attitude")
                 self.heads = [ui.label().classes("quiet num") for _ in range(3)]
                 self.kinds = [widgets.quiet(KINDS[0])]
-                self.inputs = [self.angle_input(n) for n in range(3)]
+                self.inputs = [self.angle_input() for _ in range(3)]
                 self.kinds.append(widgets.quiet(KINDS[1]))
                 self.estimates = [
                     LiveText(page.contents, "–").classes("mono num") for _ in range(3)
@@ -52,17 +52,14 @@ class AttitudeCard:
                 self.errors = [
                     LiveText(page.contents, "–").classes("mono num") for _ in range(3)
                 ]
-            self.status = (
-                LiveText(page.contents).classes("mono ellipsis lab-status").mark("status")
-            )
-            self.stages = ui.label(" ").classes("quiet ellipsis").mark("stages")
+            self.status = LiveText(page.contents).classes("mono ellipsis lab-status")
+            self.stages = ui.label(" ").classes("quiet ellipsis")
         page.derive(lambda view: view.image, self.empty)
 
-    def angle_input(self, n: int) -> LiveInput:
+    def angle_input(self) -> LiveInput:
         return (
             LiveInput(self.page.contents, "text")
             .classes("mono lab-angle")
-            .mark(f"angle-{n}")
             .on("keydown.enter", self.point, js_handler=ANGLES_JS)
         )
 
@@ -178,7 +175,7 @@ class LightsPanel:
     def __init__(self, page: context.PageContext) -> None:
         self.page = page
         self.sent = 0
-        self.table = LightsTable().mark("lights")
+        self.table = LightsTable()
 
     def update(self) -> None:
         """Send the table if the sensor shows another frame; called every UPDATE_S while the panel is open."""
@@ -277,13 +274,9 @@ class LogPanel:
     def __init__(self, page: context.PageContext) -> None:
         self.page = page
         self.kept: MutableMapping[str, list[Any]] = {"lines": [], "rows": []}
-        self.button = widgets.button(
-            "CSV of the identifications", self.download, "log-csv", "flat"
-        )
+        self.button = widgets.button("CSV of the identifications", self.download, "flat")
         self.button.set_enabled(False)
-        self.label = (
-            ui.label("Nothing yet.").classes("mono lab-log").props('role="log"').mark("log")
-        )
+        self.label = ui.label("Nothing yet.").classes("mono lab-log").props('role="log"')
 
     def add(self, text: str) -> None:
         lines = [f"{time.strftime('%H:%M:%S')}  {text}", *self.kept["lines"]][:MAX_LINES]

@@ -34,10 +34,10 @@ class RealPanel:
             self.views = ui.toggle(
                 [*REAL_VIEWS, BLINK], value=self.shown, on_change=self.choose
             )
-            self.views.props("dense no-caps unelevated size=sm").mark("real-views")
-            self.text = ui.label().style("white-space: pre-line").mark("real")
-            widgets.button("Explain the residuals", self.explain, "explain")
-            self.answer = ui.label().mark("explanation")
+            self.views.props("dense no-caps unelevated size=sm")
+            self.text = ui.label().style("white-space: pre-line")
+            widgets.button("Explain the residuals", self.explain)
+            self.answer = ui.label()
         self.empty()
         page.derive(lambda view: view.opened, self.empty)
 

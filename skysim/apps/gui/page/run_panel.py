@@ -112,7 +112,7 @@ class RunPanel:
 
     def build(self) -> None:
         with widgets.row(1):
-            self.simulate_button = widgets.button("Simulate", self.simulate, "fly")
+            self.simulate_button = widgets.button("Simulate", self.simulate)
             self.back = self.player_button(
                 "skip_previous", "Previous frame", partial(self.step, -1)
             )
@@ -125,7 +125,7 @@ class RunPanel:
                 self.resync
             )
             self.loop = widgets.select({}, "borderless", on_change=self.close_loop)
-            self.loop.props('aria-label="Feedback"').mark("feedback")
+            self.loop.props('aria-label="Feedback"')
         self.bar = ui.linear_progress(0, show_value=False, size="3px").props(
             "instant-feedback"
         )
@@ -136,27 +136,22 @@ class RunPanel:
             self.seek.classes("lab-seek").on(
                 "input", self.slid, js_handler="event => emit(event.target.value)"
             )
-            self.clock = (
-                widgets.LiveText(self.page.contents).classes("mono flex-none").mark("clock")
-            )
+            self.clock = widgets.LiveText(self.page.contents).classes("mono flex-none")
         with widgets.row(3):
-            self.summary = ui.label().classes("quiet flex-grow").mark("flight")
-            self.keep_button = widgets.button("Keep as reference", self.keep, "keep", "flat")
+            self.summary = ui.label().classes("quiet flex-grow")
+            self.keep_button = widgets.button("Keep as reference", self.keep, "flat")
             self.keep_button.props("no-wrap")
-            self.csv_button = widgets.button("CSV", self.download, "csv", "flat")
+            self.csv_button = widgets.button("CSV", self.download, "flat")
         self.comparison = Comparison().on("switch", self.switch).on("forget", self.forget)
-        self.timeline = Timeline().on("moment", self.clicked).mark("timeline")
-        self.strips = Strips().on("moment", self.clicked).mark("strips")
-        self.lights = FlightLights().mark("residuals")
+        self.timeline = Timeline().on("moment", self.clicked)
+        self.strips = Strips().on("moment", self.clicked)
+        self.lights = FlightLights()
         self.clear()
         self.page.derive(lambda view: view.opened, self.clear)
         self.page.derive(lambda view: view.kind == "flight", self.hide_moment)
 
     def player_button(self, icon: str, label: str, action: Any) -> ui.button:
-        button = ui.button(icon=icon, on_click=action).props(
-            f'dense flat aria-label="{label}"'
-        )
-        return button.mark(label.lower())
+        return ui.button(icon=icon, on_click=action).props(f'dense flat aria-label="{label}"')
 
     @property
     def is_ready(self) -> bool:

@@ -81,15 +81,13 @@ class ScenePanel:
         self.saved = saved
         with widgets.row().style("margin-bottom: 8px"):
             self.find = ui.input(placeholder="find a key", on_change=self.search)
-            self.find.props("dense outlined clearable").classes("flex-grow").mark("find-key")
+            self.find.props("dense outlined clearable").classes("flex-grow")
             self.name = ui.input(placeholder="new-name").props(
                 'dense outlined aria-label="Name of the new scene"'
             )
-            self.name.classes("w-36").mark("save-name")
-            widgets.button("Save as", self.save, "save").props("no-wrap")
-            self.undo = widgets.button("Undo all", self.revert, "revert", "flat").props(
-                "no-wrap"
-            )
+            self.name.classes("w-36")
+            widgets.button("Save as", self.save).props("no-wrap")
+            self.undo = widgets.button("Undo all", self.revert, "flat").props("no-wrap")
         self.no_match = ui.label("No key contains this text.").classes("w-full empty")
         self.no_match.set_visibility(False)
         self.parts = ui.column().classes("lab-sections w-full gap-0")
@@ -153,9 +151,7 @@ class ScenePanel:
                     f'dense outlined suffix="{field.unit}"'
                 )
                 entry.on("keydown.enter", edit).on("blur", edit)
-            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px").mark(
-                f"key-{field.key}"
-            )
+            entry.classes("flex-grow").style("width: 0; margin-bottom: 3px")
             entry.props(f'hide-bottom-space aria-label="{field.key}"')
         self.rows[field.key] = KeyRow(field, box, head, entry, field.shown)
 

@@ -132,7 +132,7 @@ class Tab(context.PageContext):
                 head.Arrangement.splitter("side", "vertical", "Width of the panels")
                 self.attitude = readouts.AttitudeCard(self)
                 await self.build_panels()
-            with widgets.div("lab-keys").mark("keys"):
+            with widgets.div("lab-keys"):
                 for key in keys.KEYS:
                     if key.description:
                         ui.html(
@@ -160,7 +160,7 @@ class Tab(context.PageContext):
                 # Otherwise the arrow keys would select tabs.
                 self.tabs.on("click", js_handler=keys.BLUR_JS)
                 for name in PANELS:
-                    ui.tab(name).mark(f"tab-{name}")
+                    ui.tab(name)
             with ui.tab_panels(
                 self.tabs, value=PANELS[0], animated=False, keep_alive=True
             ).classes("lab-panels"):
@@ -285,8 +285,10 @@ class Tab(context.PageContext):
         """Show the first view: that of the page's address, or of the browser's storage, or the server's scene."""
         self.use(session)
         self.new_session = new_session
-        self.log_panel.keep(app.storage.tab)
         await self.arrangement.restore()
+        # Without a browser there is no storage.
+        if ui.context.client.has_socket_connection:
+            self.log_panel.keep(app.storage.tab)
         await self.show_query(await self.history.read())
         refusal = self.message_text
         if self.is_open and self.view is None and await self.open(self.state.scene):
@@ -358,14 +360,18 @@ class Tab(context.PageContext):
                 )
             return False
         self.scene_info, view = result
-        head = self.scene_info.head
+        shown = self.scene_info.head
         running = self.study_panel.running
-        self.set_state(scene=scene, overrides=overrides, study=running, head=head)
+        self.set_state(scene=scene, overrides=overrides, study=running, head=shown)
         self.set_scene(self.scene_info)
         self.show_frame(view, kind="live", angles_deg=view.angles_deg)
         self.form.hide_others(scene)
         await self.fill_form()
         self.log(f"opened {name}" + (f" with {', '.join(overrides)}" if overrides else ""))
+        if head != shown:
+            self.show_message(
+                f"{name} has no camera {head!r}; allowed: {', '.join(self.scene_info.heads)}"
+            )
         return True
 
     def set_scene(self, info: SceneInfo) -> None:

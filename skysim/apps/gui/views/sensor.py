@@ -95,12 +95,12 @@ class SensorView:
         self.frame_drawn = asyncio.Event()
         with widgets.div("lab-sensor"):
             self.build_controls()
-            with Canvas().mark("sensor") as self.canvas:
-                self.hover = widgets.LiveText(contents).classes("mono").mark("hover")
+            with Canvas() as self.canvas:
+                self.hover = widgets.LiveText(contents).classes("mono")
             with self.canvas.add_slot("wait"), widgets.div("lab-wait") as self.wait:
                 # No spinner: without a graphics card each takes a sixth of a core from the worker that it waits for.
                 self.waited = widgets.div("lab-waited mono")
-                self.wait_label = ui.label().mark("wait")
+                self.wait_label = ui.label()
         contents.send = lambda changed: self.canvas.run_method("setContents", changed)
         self.canvas.on("hover", self.hover_changed)
         self.canvas.on("manual", lambda: self.limits.set_value("manual"))
@@ -138,10 +138,9 @@ class SensorView:
         with widgets.div("lab-bar"):
             for kind in overlay.KINDS:
                 box = widgets.checkbox(kind, value=kind in self.shown)
-                box.style(f"color: {overlay.COLORS[kind]}").mark(f"overlay-{kind}")
+                box.style(f"color: {overlay.COLORS[kind]}")
                 box.on_value_change(lambda event, kind=kind: self.toggle(kind, event.value))
             self.grid = widgets.checkbox("grid", on_change=self.update_display)
-            self.grid.mark("grid")
             ui.space()
             self.stretch = self.select("Stretch", STRETCHES, "w-28")
             self.limits = self.select("Limits", LIMITS, "w-24")

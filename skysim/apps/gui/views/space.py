@@ -48,14 +48,11 @@ class Scene3D:
         self.newest_view: FrameView | None = None
         self.legend: ui.element | None = None
         self.waits = False
-        self.canvas = Space().classes("w-full h-full").mark("space")
+        self.canvas = Space().classes("w-full h-full")
         with widgets.div("lab-looks"):
             for name, text in VIEWS.items():
-                button = ui.button(
-                    name, color=None, on_click=lambda name=name: self.look(name)
-                )
-                button.props(f'dense outline size=xs title="look {text}"').mark(
-                    f"look-{name}"
+                ui.button(name, color=None, on_click=lambda name=name: self.look(name)).props(
+                    f'dense outline size=xs title="look {text}"'
                 )
         hint = ui.label(
             "drag: rotate · drag the vehicle: push it · right drag: pan · wheel: zoom"
@@ -148,10 +145,10 @@ class PushControl:
         canvas.on("grip", self.gripped)
         canvas.on("release", self.released)
         with widgets.div("lab-push") as self.bar:
-            self.label = ui.label().classes("mono").mark("push")
+            self.label = ui.label().classes("mono")
             ui.button("reset", color=None, on_click=self.reset).props(
                 'dense outline size=xs title="back to the attitude before the push"'
-            ).mark("push-reset")
+            )
         self.bar.set_visibility(False)
 
     async def gripped(self, event: Any) -> None:

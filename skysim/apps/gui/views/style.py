@@ -236,6 +236,8 @@ body {{ background: {COLORS["ground"]} !important; color: {COLORS["text"]};
   .lab-run > .row:first-child {{ flex-wrap: wrap }}
 }}
 @media (max-width: 600px) {{
+  .lab-sensor {{ grid-template-rows: auto calc(75vw + 260px) }}
+  .lab-view {{ grid-template-rows: minmax(0, 1fr) 24px 236px }}
   .lab-trial {{ grid-template-columns: repeat(2, minmax(0, 1fr)) }}
   .lab-lights tr > :is(:nth-child(6), :nth-child(7)) {{ display: none }}
   .lab-grid {{ grid-template-columns: 60px repeat(3, minmax(0, 1fr)); gap: 2px 6px }}

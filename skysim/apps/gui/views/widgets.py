@@ -38,21 +38,17 @@ def quiet(text: str = "") -> ui.label:
     return ui.label(text).classes("quiet")
 
 
-def button(
-    label: str, action: Callable[[], Any], mark: str = "", look: str = "outline"
-) -> ui.button:
+def button(label: str, action: Callable[[], Any], look: str = "outline") -> ui.button:
     """A small button.
 
     Parameters
     ----------
     action
         Function that is called (and awaited, if it is asynchronous) when the button is pressed
-    mark
-        Name by which tests find the button
     look
         Quasar's style: outline or flat
     """
-    return ui.button(label, on_click=action).props(f"dense {look} size=sm").mark(mark)
+    return ui.button(label, on_click=action).props(f"dense {look} size=sm")
 
 
 def select(options: Any, look: str = "outlined", **settings: Any) -> ui.select:

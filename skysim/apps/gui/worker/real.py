@@ -15,6 +15,7 @@ from skysim.apps.gui.messages import REAL_VIEWS
 from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker.photo import Photo, PhotoPixels, scene_photo
 from skysim.apps.gui.worker.playback import UNCERTAINTY
+from skysim.apps.live.gige import open_camera
 from skysim.apps.plate_solver import plate_solution
 from skysim.core import images
 from skysim.core.errors import InputError
@@ -50,7 +51,7 @@ class RealSource:
 
     def __init__(self, source: str) -> None:
         self.folder = Path(source) if Path(source).is_dir() else None
-        self.camera = None if self.folder else images.LiveCamera(source)
+        self.camera = None if self.folder else open_camera(source)
         self.files = survey_procedure.CompleteFiles()
         self.waiting: list[Path] = []
 

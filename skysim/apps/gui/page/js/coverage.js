@@ -16,7 +16,7 @@ export default {
     <div class="lab-coverage">
       <p class="quiet">{{ text }}</p>
       <svg v-if="total" :viewBox="box" role="group" aria-label="Map of coverage">
-        <g v-for="ring in rings" class="ring"><circle :r="ring.r"></circle><text :y="3 - ring.r">{{ ring.label }}</text></g>
+        <g v-for="ring in rings" class="ring"><circle :r="ring.r"></circle><text :x="ring.x" :y="ring.y">{{ ring.label }}</text></g>
         <g v-for="(one, n) in marks" :key="n" role="button" tabindex="0" :aria-label="one.title" :class="one.state"
           :transform="one.move" @click="$emit('point', n)" @keydown.enter="$emit('point', n)">
           <title>{{ one.title }}</title><path :d="one.path" :style="one.style"></path><text y="4">{{ one.lights }}</text>
@@ -37,15 +37,26 @@ export default {
       const { color, path } = STATES[name], css = `var(--lab-${color})`;
       return { path, style: { stroke: css, fill: css } };
     },
+    // The place on a ring that is farthest from all marks: there its label is read.
+    free(r) {
+      const found = Array.from({ length: 48 }, (_, n) => {
+        const azimuth = (n * Math.PI) / 24 - Math.PI / 2, x = r * Math.cos(azimuth), y = r * Math.sin(azimuth);
+        return { x, y: y + 3, away: Math.min(...this.places.map(([mx, my]) => Math.hypot(x - mx, y - my))) };
+      });
+      return found.reduce((best, one) => (one.away > best.away + 0.5 ? one : best));
+    },
     // A new map, or none. directions: of the boresights, z in the middle of the map
     begin(directions, isSky) {
       const most = Math.max(...directions.map(polar), 0.02), degree = Math.PI / 180;
       const step = RINGS_DEG.find((ring) => most / degree / ring < 4.5) ?? 60;
       const labels = Array.from({ length: Math.floor(most / degree / step + 1e-6) }, (_, n) => (n + 1) * step);
-      this.rings = labels.map((ring) => ({ r: (ring * degree * R) / most, label: isSky ? `Dec ${90 - ring}°` : `${ring}°` }));
       this.places = directions.map((at) => {
         const away = (polar(at) * R) / most, azimuth = Math.atan2(at[1], at[0]);
         return [away * Math.cos(azimuth), -away * Math.sin(azimuth)];
+      });
+      this.rings = labels.map((ring) => {
+        const r = (ring * degree * R) / most;
+        return { r, ...this.free(r), label: isSky ? `Dec ${90 - ring}°` : `${ring}°` };
       });
       this.directions = directions;
       this.view = isSky ? "North is in the middle, RA 0° on the right." : "As seen from above, the lab's x axis to the right.";

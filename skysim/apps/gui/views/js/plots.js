@@ -47,7 +47,7 @@ export function drawHistogram(pen, { pixels, histogram, well }, levels, [width, 
   for (const peak of peaks) pen.fillRect(axis.at(peak) - 0.5, MARGIN.top, 1.5, 7);
   const brightest = inElectrons(Math.max(histogram.range[1], ...peaks));
   pen.fillStyle = QUIET;
-  pen.fillText(`${brief(brightest)} e⁻ of ${brief(full)}: ${((100 * brightest) / full).toPrecision(3)} %`, MARGIN.left, 11);
+  pen.fillText(`${brief(brightest)} e⁻ of ${brief(full)}: ${((100 * brightest) / full).toPrecision(3)} %`, MARGIN.left, 11, width - 2 * MARGIN.left);
   const at = axis.at((full / well[0] + well[1] - pixels.offset) / pixels.step);
   pen.fillStyle = FULL;
   if (at < width) pen.fillRect(at - 1, MARGIN.top, 2, room); // the full well
