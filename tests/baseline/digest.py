@@ -16,7 +16,9 @@ from astropy.io import fits
 Entries = Iterator[tuple[str, str]]
 DIGITS = 24  # of a SHA-256, in hexadecimal
 # Keys and columns that change from run to run, or with every change of the code: times by the clock, digests of code.
-CHANGING = re.compile(r"(\w*_)?((time|detect|late)_ms\w*|stages_ms|seconds|unix_s|code|scene)")
+CHANGING = re.compile(
+    r"(\w*_)?((time|detect|late)_ms\w*|stages_ms|seconds|unix_s|code|scene)"
+)
 
 
 def sha(data: bytes | str) -> str:

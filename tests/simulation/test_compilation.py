@@ -39,7 +39,8 @@ try:
 finally:
     json.dump(sorted(found), open("modules.json", "w"))
 """
-# Prints light, centroids and attitude. With a second argument functions with fastmath are loaded from numba's cache before those that call them.
+# Prints light, centroids and attitude. With a second argument functions with fastmath are loaded from numba's cache
+# before those that call them.
 FLY = """
 import sys
 from skysim.scene import loader
