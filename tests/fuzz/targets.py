@@ -19,9 +19,10 @@ import numpy as np
 from estimator.catalog import cat_file, catalog, published_catalogs
 from estimator.core.errors import ImageError
 from skysim.apps.cli.commands import validate
-from skysim.apps.live import gige
+from skysim.apps.live import gige, gige_receiver
 from skysim.apps.live.commands import CommandState, Inbox, parse
 from skysim.apps.live.gige import GigeCamera
+from skysim.apps.live.gige_receiver import GigeReceiver
 from skysim.apps.live.pacing import Live, Pace, pose_samples
 from skysim.apps.live.packets import unpack
 from skysim.apps.plate_solver import picture
@@ -288,7 +289,7 @@ def datagrams(data: bytes) -> None:
 
 def gvsp(data: bytes) -> None:
     """Packets that anyone sends to the receiver of a camera, each after its length in two bytes."""
-    receiver = gige.GigeReceiver("gige://127.0.0.1")
+    receiver = GigeReceiver("gige://127.0.0.1")
     sent = 0
     with receiver.control, receiver.stream:
         while sent < len(data):
@@ -296,15 +297,15 @@ def gvsp(data: bytes) -> None:
             packet = data[sent + 2 : end]
             rejects(lambda packet=packet: receiver.take(packet), InputError)
             sent = end
-            if len(receiver.parts) > gige.MOST_PACKETS:
+            if len(receiver.parts) > gige_receiver.MOST_PACKETS:
                 raise AssertionError("more packets are kept than a frame has")
 
 
 def genicam(data: bytes) -> None:
     """A GenICam file of any camera: its registers are found, or it is refused."""
-    receiver = gige.GigeReceiver("gige://127.0.0.1")
+    receiver = GigeReceiver("gige://127.0.0.1")
     place = b"Local:camera.xml;%X;%X" % (gige.XML, len(data))
-    memory = {gige.XML_ADDRESS: place.ljust(gige.READ_BYTES, b"\0")}
+    memory = {gige.XML_ADDRESS: place.ljust(gige_receiver.READ_BYTES, b"\0")}
     memory |= {gige.XML + at: data[at : at + 512] for at in range(0, len(data), 512)}
     receiver.command = lambda _, at, *size: b"addr" + memory[at]  # type: ignore[method-assign]
     with receiver.control, receiver.stream:

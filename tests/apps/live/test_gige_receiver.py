@@ -22,7 +22,8 @@ import pytest
 
 from skysim.apps.gui.worker.real import RealSource
 from skysim.apps.live import gige
-from skysim.apps.live.gige import GigeCamera, GigeReceiver
+from skysim.apps.live.gige import GigeCamera
+from skysim.apps.live.gige_receiver import GigeReceiver
 from skysim.core.errors import InputError
 from skysim.core.paths import DATA
 from skysim.core.types import Array

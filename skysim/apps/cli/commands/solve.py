@@ -177,7 +177,7 @@ def numbers(name: str, text: str | None, separator: str, count: int, kind: Any) 
 def pictures(images: list[Path], live: str | None, out: Path, sequence: bool) -> list[Path]:
     """The files to solve, with a frame of the live camera, which is written to `out`. Raises InputError without any."""
     from skysim.apps import plate_solver
-    from skysim.apps.live.gige import open_camera
+    from skysim.apps.live.gige_receiver import open_camera
     from skysim.core import files
     from skysim.core.images import stem_of
 

@@ -15,7 +15,7 @@ from skysim.apps.gui.messages import REAL_VIEWS
 from skysim.apps.gui.worker import workbench
 from skysim.apps.gui.worker.photo import Photo, PhotoPixels, scene_photo
 from skysim.apps.gui.worker.playback import UNCERTAINTY
-from skysim.apps.live.gige import open_camera
+from skysim.apps.live.gige_receiver import open_camera
 from skysim.apps.plate_solver import plate_solution
 from skysim.core import images
 from skysim.core.errors import InputError
