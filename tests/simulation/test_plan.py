@@ -843,15 +843,15 @@ def test_only_the_plans_with_saturated_and_too_few_leds_are_warned_of() -> None:
 
 @pytest.mark.slow
 def test_a_check_costs_a_fraction_of_a_second() -> None:
-    """Of CPU, after its functions were loaded once: against the time to set up the same scene, twice."""
+    """Of CPU, after its functions were loaded once: against the time to set up the same scene, ten times."""
     lab = lab_of("shefex2")
     check(lab)
     began = time.process_time()
     check(lab)
     checked = time.process_time()
-    for _ in range(2):
+    for _ in range(10):
         build_tracker(lab_of("shefex2").camera)
-    assert checked - began < 2 * (time.process_time() - checked)
+    assert checked - began < time.process_time() - checked
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 
 from skysim.apps.gui.worker.real import RealSource
-from skysim.apps.live import gige
+from skysim.apps.live import gige, gige_receiver
 from skysim.apps.live.gige import GigeCamera
 from skysim.apps.live.gige_receiver import GigeReceiver
 from skysim.core.errors import InputError
@@ -167,7 +167,7 @@ def test_a_long_wait_for_a_frame_keeps_the_control() -> None:
                 found.append(str(error))
 
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(gige, "PATIENCE_S", 2.0)
+            patch.setattr(gige_receiver, "PATIENCE_S", 2.0)
             thread = threading.Thread(target=wait)
             thread.start()
             time.sleep(1.5)

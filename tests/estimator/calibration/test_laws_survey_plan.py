@@ -17,6 +17,7 @@ from estimator.calibration import (
     survey_plan,
     survey_subset,
 )
+from estimator.calibration.bundle_adjustment import Bundle
 from estimator.calibration.survey_faults import HeldFrames, LightTable
 from estimator.calibration.survey_plan import SurveyAccuracy, SurveyModel
 from estimator.core.camera import Camera
@@ -62,6 +63,24 @@ def test_predicted_errors_grow_with_noise_and_list_errors_and_shrink_with_frames
     assert (every.lever_sigma_m <= first.lever_sigma_m * (1 + 1e-9)).all()
     assert 0 < every.led_rms_m <= assumed.leds_sigma_m
     assert not seen[:, ~every.measured].sum(axis=0).max(initial=0) > len(held)
+
+
+@law(SurveyModel.assumed, slow=True)
+@given(rng=SEEDS, lever_sigma_m=some.floats(1e-6, 1e-3))
+def test_what_is_known_of_the_lever_and_the_lens_is_not_lost(
+    rng: np.random.Generator, lever_sigma_m: float
+) -> None:
+    """The prior has the model's values, and a survey knows both at least as well as its prior."""
+    known = replace(model(50), lever_sigma_m=lever_sigma_m, focal_sigma_px=0.1)
+    prior = known.assumed
+    start = Bundle.start(known.leds, known.lever, known.camera, Rotation.identity(1), False)
+    assert not prior.less(start).any()
+    held = attitudes(rng, 25)
+    found = answered(lambda: survey_plan.predict(known, held, known.visible(held)))
+    if found is None:
+        return
+    assert (found.lever_sigma_m <= prior.lever_sigma_m * (1 + 1e-9)).all()
+    assert found.lens_sigma[0] <= prior.focal_sigma_px * (1 + 1e-9)
 
 
 @law(survey_plan.choose)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import itertools
+import math
 import tempfile
 from dataclasses import FrozenInstanceError
 from pathlib import Path
@@ -25,7 +26,7 @@ from estimator.catalog.catalog import StarCatalog
 from estimator.core import checks, errors
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
-from estimator.core.vectors import rotation_of
+from estimator.core.vectors import lengths, rms, rotation_of
 from estimator.detection import detect
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Settings
@@ -424,6 +425,19 @@ def test_a_rotation_without_scipy_s_checks_is_the_same(rng: np.random.Generator)
     place = rng.standard_normal((3, 3))
     np.testing.assert_array_equal(made.apply(place), known.apply(place))
     np.testing.assert_array_equal((made * known.inv()).as_quat()[:3], np.zeros(3))
+
+
+@law(lengths, rms)
+@given(rng=SEEDS, scale=some.floats(1e-3, 1e3))
+def test_a_length_and_a_root_mean_square_follow_their_definitions(
+    rng: np.random.Generator, scale: float
+) -> None:
+    vectors = scale * rng.standard_normal((4, 5, 3))
+    wanted = [[math.hypot(*vector) for vector in row] for row in vectors]
+    np.testing.assert_allclose(lengths(vectors), wanted, rtol=1e-14)
+    # The mean square of vectors is three times that of their components.
+    assert rms(lengths(vectors)) == pytest.approx(math.sqrt(3) * rms(vectors), rel=1e-12)
+    assert rms(np.full(3, -scale)) == pytest.approx(scale, rel=1e-12)
 
 
 @law(errors.file_bytes, errors.reason)
