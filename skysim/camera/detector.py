@@ -93,7 +93,7 @@ class Detector:
     column_offset_e: Singles
 
     @classmethod
-    @lru_cache(maxsize=4)  # laboratories of one process often share a camera
+    @lru_cache(maxsize=2)  # laboratories of one process often share a camera
     def from_camera(cls, camera: CameraConfig) -> "Detector":
         """Draw the fixed pattern of a camera's chip; each kind has its own random stream."""
         config = camera.detector

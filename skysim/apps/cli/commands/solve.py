@@ -177,12 +177,13 @@ def numbers(name: str, text: str | None, separator: str, count: int, kind: Any) 
 def pictures(images: list[Path], live: str | None, out: Path, sequence: bool) -> list[Path]:
     """The files to solve, with a frame of the live camera, which is written to `out`. Raises InputError without any."""
     from skysim.apps import plate_solver
-    from skysim.apps.live.gige_receiver import open_camera
     from skysim.core import files
     from skysim.core.images import stem_of
 
     paths = plate_solver.pictures_in(images)
     if live is not None:
+        from skysim.apps.live.gige_receiver import open_camera
+
         paths.append(out / "live.png")
         with closing(open_camera(live)) as camera:
             files.write_image(paths[-1], camera.frame())
