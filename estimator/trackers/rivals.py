@@ -188,4 +188,5 @@ def _find(
     detections = chosen(detections_of(lights, sensor, 0.0), rest)
     if quads is None:
         return star_search.lost_in_space(detections, sky, most, np.int64(MAX_CHECKS))
-    return star_quads.identify(detections, quads, sky, most, np.int64(QUAD_CHECKS), False)
+    checks = np.int64(QUAD_CHECKS)
+    return star_quads.identify(detections, quads, sky, most, checks, np.bool_(False))

@@ -131,6 +131,7 @@ def test_the_answer_refers_to_the_image_as_viewed(
     assert height * WIDTH_PX == width * HEIGHT_PX
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("orientation", "turned_deg"), [(3, 180), (6, -90), (8, 90)])
 def test_without_its_orientation_tag_an_image_has_another_attitude(
     sky: tuple[Scene, Frame, Truth],

@@ -182,6 +182,7 @@ def gaussian_px(center: float, sigma_px: float) -> Floats:
     return np.diff(erf(edges)) / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_px", [0.4, 0.5, 0.7, 1.0])
 def test_the_centroid_of_a_narrow_colored_star_is_biased_as_the_mosaic_samples_it(
     sigma_px: float,

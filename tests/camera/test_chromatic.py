@@ -167,6 +167,7 @@ def test_chromatic_images_match_the_integral_over_wavelength(case: str) -> None:
     assert square > 1.02 * 2 * (0.7**2 + 1 / 12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", ["a blue star", "a red star", "a white LED", "a blue LED"])
 @pytest.mark.parametrize("psf", ["gaussian", "coma"])
 def test_lateral_color_spreads_an_image_as_its_wavelengths_do(case: str, psf: str) -> None:

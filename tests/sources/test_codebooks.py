@@ -257,6 +257,7 @@ def test_codes_without_enough_words_are_empty() -> None:
     assert codebooks.cyclic(2**20 + 1, 3).shape == (0, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("count", "distance"), [(1, 3), (2, 3), (5, 5), (50, 7)])
 def test_a_cyclic_code_is_the_shortest_with_enough_orbits(count: int, distance: int) -> None:
     """By listing all words of all lengths: the orbits of their full length under shifts."""

@@ -444,6 +444,7 @@ def test_a_satellite_behind_the_earth_is_not_seen(monkeypatch: pytest.MonkeyPatc
     assert [one.truth.id - satellites.ID_BASE for one in found] == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("turn_rad", [0.0, 0.3])
 def test_random_satellites_fill_the_cone_of_all_paths(turn_rad: float) -> None:
     """Uniform in the cosine to the field's edge and half of both turns; a great circle's acceleration; any heading."""

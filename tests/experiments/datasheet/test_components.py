@@ -38,6 +38,7 @@ def generated(rng, shape, bias=0.0, **sigma):
     return errors
 
 
+@pytest.mark.slow
 def test_injected_terms_are_recovered_to_five_percent():
     """Over many experiments, whose mean is the expectation: of the thermal states those that are there."""
     rng = np.random.default_rng(1)

@@ -78,6 +78,7 @@ def test_at_rest_only_the_noise_changes(model):
     assert errors.std(axis=0) == pytest.approx(scales * model.noise[0], rel=0.02)
 
 
+@pytest.mark.slow
 def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     rng = np.random.default_rng(6)
     errors = np.array([model.draw(np.full(2, 1.0), 0.1, rng)[1] for _ in range(8000)])
@@ -89,6 +90,7 @@ def test_over_many_units_and_fields_the_variance_is_the_sum_of_the_terms(model):
     assert np.mean(errors**2, axis=0) == pytest.approx(expected, rel=0.08)
 
 
+@pytest.mark.slow
 def test_steps_of_a_process_have_the_statistics_of_independent_draws(model):
     """Mean square and correlation from one step to the next at 2 degrees per second."""
     rng = np.random.default_rng(7)

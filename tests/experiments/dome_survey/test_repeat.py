@@ -17,6 +17,7 @@ from skysim.experiments.dome_survey import adjust, survey_frames, survey_procedu
 from skysim.experiments.dome_survey.survey_procedure import SimulatedErrors
 
 
+@pytest.mark.slow
 def test_a_failed_survey_does_not_lose_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """The first of three fails; the rms of the others is that of their mean squares."""
     found = iter(
