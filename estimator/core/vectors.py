@@ -18,7 +18,7 @@ def lengths(vectors: Floats) -> Floats:
 
 def normalized(vectors: Floats) -> Floats:
     """Return (..., K) vectors, divided by their lengths."""
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / lengths(vectors)[..., None]
 
 
 def rms(values: Floats) -> float:

@@ -218,13 +218,16 @@ class FlightComputer:
 
         They are those of the controls (..., nu) and the full qvel (..., nv).
         """
+        # Without a law no motor is commanded.
+        if not self.names:
+            return {}
         actuator = self.actuator
         loads = np.abs(control[..., actuator.motor]) / actuator.limit
         if isinstance(actuator, WheelActuator):
             # The speed of a wheel counts if it is closer to its limit.
             speeds = np.abs(speeds_rad_s[..., actuator.hinges.dof])
             loads = np.maximum(loads, speeds / actuator.speed_limit_rad_s)
-        return dict(zip(self.names, loads.T, strict=False))
+        return dict(zip(self.names, loads.T, strict=True))
 
 
 def return_rate_limit_rad_s(scene: Scene) -> float:

@@ -289,8 +289,8 @@ def read_for(key: str, name: str) -> Catalog:
 
 
 @lru_cache(maxsize=4)
-def read_once(path: Path, changed_ns: int) -> Catalog:
-    """The stars of a file; it is read again only after a change, by its time."""
+def read_once(path: Path, _changed_ns: int) -> Catalog:
+    """The stars of a file; it is read again only after a change, by its time, which is part of the cache's key."""
     return read(path)
 
 

@@ -434,7 +434,7 @@ def test_json_output_keeps_its_keys_and_adds_details(gray: NDArray, tmp_path: Pa
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["x.JPG", pytest.param("x.fits.gz", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("name", ["x.JPG", "x.fits.gz"])
 def test_the_browser_s_panel_solves_the_same_image(
     sky: tuple[Scene, Frame, Truth], gray: NDArray, tmp_path: Path, name: str
 ) -> None:

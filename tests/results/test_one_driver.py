@@ -37,9 +37,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "frames"), [("shefex2", 2), pytest.param("two_heads", 2, marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize(("name", "frames"), [("shefex2", 2), ("two_heads", 2)])
 def test_the_command_and_python_write_the_same_files(
     tmp_path: Path, name: str, frames: int
 ) -> None:
