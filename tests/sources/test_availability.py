@@ -121,3 +121,22 @@ def test_stars_are_counted_to_the_edge_of_the_field(sphere: CircularOrbit) -> No
         sphere, START, np.array([0.0, 1.0]), Pointing("inertial", axis), stars, 0.3
     )
     assert found.stars.tolist() == [3, 3]
+
+
+def test_a_boresight_is_outside_a_body_s_exclusion_only_beyond_its_own_angle() -> None:
+    """Three times: within, at and beyond the limit of one body, while the others' limits are elsewhere."""
+    near = np.array([-1.0, 0.0, 1.0])
+    exclusion = ExclusionConfig(sun_deg=40, earth_deg=25, moon_deg=10, stars=5)
+    found = camera_orbit.SkySamples(
+        t_s=np.arange(3.0),
+        sun_deg=40 + near,
+        earth_deg=25 + near,
+        moon_deg=10 + near,
+        stars=np.array([4, 5, 6]),
+    ).outside(exclusion)
+    assert {body: ok.tolist() for body, ok in found.items()} == {
+        "Sun": [False, False, True],
+        "Earth": [False, False, True],
+        "Moon": [False, False, True],
+        "stars": [False, True, True],
+    }
