@@ -61,6 +61,8 @@ def test_a_view_is_restored_from_its_url(view: PageView) -> None:
         ("?scene=shefex2&at=1,2", "three angles"),
         ("?scene=shefex2&at=1,2,nan", "three angles"),
         ("?scene=shefex2&view=flight&t=soon", "allowed: numbers"),
+        ("?scene=shefex2&veiw=flight", "'veiw'; allowed: scene, set, view"),
+        ("?scne=shefex2", "'scne'; allowed: scene"),
     ],
 )
 def test_an_invalid_view_url_is_refused_in_one_line(query: str, message: str) -> None:

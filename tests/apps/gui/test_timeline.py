@@ -14,6 +14,7 @@ from tests.helpers.labpage import (
     CHROMIUM,
     NARROW,
     Server,
+    address,
     come,
     open_scene,
     opened,
@@ -121,3 +122,10 @@ def test_a_click_on_an_event_shows_its_frame(browser: Any, server: Server) -> No
         t_s = float(label.split(" s:")[0])
         events.nth(3).click()
         page.locator("[data-state=flight]", has_text=f"flight at {t_s:.2f} s").wait_for()
+        # A link to a time after the flight
+        assert come(lambda: "view=flight" in address(page))
+        page.goto(re.sub(r"&t=[\d.]+", "&t=999", address(page)))
+        said = page.get_by_role("status").filter(
+            has_text="999 s is after the last frame, at "
+        )
+        said.wait_for()

@@ -431,6 +431,9 @@ class RunPanel:
         if self.is_ready:
             self.pause()
             await self.show_index(nearest(self.rows, t_s))
+            last_s = TIME_S(self.rows[-1])
+            if t_s > last_s + 1e-4:  # an address rounds to this
+                self.page.show_message(f"{t_s:g} s is after the last frame, at {last_s:g} s")
 
     async def slid(self, event: Any) -> None:
         """Show the frame at the position of the dragged slider; skip all but the newest position."""

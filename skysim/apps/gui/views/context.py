@@ -250,6 +250,8 @@ class PageContext:
 
 Kind = Literal["live", "flight", "replay", "photo"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
+# Keys of an address
+KEYS = ("scene", "set", "view", "at", "t", "study", "trial", "photo", "head", "token")
 
 
 @frozen
@@ -337,6 +339,9 @@ class PageView:
         """
         pairs = parse_qsl(query.removeprefix("?"))
         one: Record = dict(pairs)
+        for key in one:
+            if key not in KEYS:
+                raise InputError("link", f"key {key!r}", ", ".join(KEYS))
         if "scene" not in one:
             return None
         if one["scene"] not in scenes:
