@@ -134,16 +134,10 @@ def cross(a: Floats, b: Floats) -> Floats:
 @jit
 def matrix_vector(matrix: Floats, v: Floats) -> Floats:
     """(3,) matrix (3, 3) times v (3,)."""
-    p = v[0]
-    q = v[1]
-    r = v[2]
-    return np.array(
-        [
-            matrix[0, 0] * p + matrix[0, 1] * q + matrix[0, 2] * r,
-            matrix[1, 0] * p + matrix[1, 1] * q + matrix[1, 2] * r,
-            matrix[2, 0] * p + matrix[2, 1] * q + matrix[2, 2] * r,
-        ]
-    )
+    out = np.empty(3)
+    for n in range(3):
+        out[n] = matrix[n, 0] * v[0] + matrix[n, 1] * v[1] + matrix[n, 2] * v[2]
+    return out
 
 
 @jit

@@ -57,8 +57,8 @@ class Pid:
 
     Attributes
     ----------
-    kp, ki, kd
-        Gains in 1/s2, 1/s3 and 1/s, the same on each axis
+    gains
+        (5,) gains kp, ki and kd in 1/s2, 1/s3 and 1/s, the same on each axis, authority, and rate limit
     limited
         Whether step 2 limited the last command
     error_rad
@@ -82,10 +82,8 @@ class Pid:
         b = config.bandwidth_rad_s
         z = config.damping
         p = config.integral_rad_s if config.law == "pid" else 0.0
-        self.kp = b**2 + 2 * z * b * p
-        self.ki = b**2 * p
-        self.kd = 2 * z * b + p
-        self.gains = self.kp, self.ki, self.kd, authority_nm, rate_limit_rad_s
+        gains = b**2 + 2 * z * b * p, b**2 * p, 2 * z * b + p
+        self.gains = np.array([*gains, authority_nm, rate_limit_rad_s])
         self.limited = False
         self.error_rad = np.zeros(3)
         self.error_sum_rad_s = np.zeros(3)
@@ -98,14 +96,17 @@ class Pid:
         momentum_nms: Floats,
     ) -> Floats:
         """(3,) torque commanded at t_s, which is held until the next call."""
-        torque_nm, self.limited = pid_torque(
-            self.reference.state_at(t_s),
-            (lab_from_body_wxyz, rate_body_rad_s),
+        torque_nm = np.empty(3)
+        self.limited = pid_torque(
+            *self.reference.state_at(t_s),
+            lab_from_body_wxyz,
+            rate_body_rad_s,
             self.error_sum_rad_s,
             self.inertia_kg_m2,
             momentum_nms,
             self.gains,
             self.error_rad,
+            torque_nm,
         )
         return torque_nm
 
@@ -123,22 +124,26 @@ class Pid:
 
 @jit
 def pid_torque(
-    reference: tuple[Floats, Floats, Floats],
-    state: tuple[Floats, Floats],
+    lab_from_ref: Floats,
+    rate_ref: Floats,
+    accel_ref: Floats,
+    lab_from_body: Floats,
+    rate: Floats,
     error_sum: Floats,
     inertia: Floats,
     momentum: Floats,
-    gains: tuple[float, float, float, float, float],
+    gains: Floats,
     error: Floats,
-) -> tuple[Floats, bool]:
-    """Torque (3,) by steps 1 to 3 of `Pid`, and whether step 2 limited the feedback.
+    torque: Floats,
+) -> bool:
+    """Set the torque (3,) by steps 1 to 3 of `Pid`; whether step 2 limited the feedback.
 
     Parameters
     ----------
-    reference
-        lab_from_ref_wxyz (4,), rate (3,) and acceleration (3,) in the reference's axes
-    state
-        lab_from_body_wxyz (4,) and rate (3,) in body axes
+    lab_from_ref, rate_ref, accel_ref
+        Attitude lab_from_ref_wxyz (4,), rate (3,) and acceleration (3,) in the reference's axes
+    lab_from_body, rate
+        Attitude lab_from_body_wxyz (4,) and rate (3,) in body axes
     error_sum
         (3,) integral of the error
     inertia
@@ -146,12 +151,10 @@ def pid_torque(
     momentum
         (3,) momentum stored in wheels and CMGs
     gains
-        kp, ki, kd, authority in N m, rate limit in rad/s
-    error
-        (3,) attitude error, set in place
+        (5,) kp, ki, kd, authority in N m, rate limit in rad/s
+    error, torque
+        (3,) attitude error and torque, set in place
     """
-    lab_from_ref, rate_ref, accel_ref = reference
-    lab_from_body, rate = state
     kp, ki, kd, authority, rate_limit = gains
     # 1. Errors. e is the rotation vector of ref_from_body, the inverse of body_from_ref.
     body_from_ref = multiply(inverse(lab_from_body), lab_from_ref)
@@ -174,7 +177,8 @@ def pid_torque(
     # 3. Euler's equation, with the gyroscopic torque of the body and of the stored momentum.
     acceleration = apply(body_from_ref, accel_ref) - feedback - kd * rate_error
     gyroscopic = cross(rate, matrix_vector(inertia, rate) + momentum)
-    return matrix_vector(inertia, acceleration) + gyroscopic, limited
+    torque[:] = matrix_vector(inertia, acceleration) + gyroscopic
+    return limited
 
 
 @jit

@@ -187,7 +187,7 @@ class FlightComputer:
         commands
             What replaces the control law
         """
-        self.control = control = np.zeros_like(self.control)
+        self.control = control = np.zeros(len(self.control))
         # 1. Control law, unless its torque or its actuators are commanded.
         torque_nm = commands.torque_nm
         has_law = (
@@ -199,13 +199,13 @@ class FlightComputer:
             )
         self.control_torque_nm = np.zeros(3) if torque_nm is None else torque_nm
         # 2. The actuators hold the body against the fans, which takes momentum out of them.
-        dump_nm = np.zeros(3)
+        actuator_torque_nm = self.control_torque_nm
         if self.momentum_dump:
             dump_nm = self.momentum_dump.allocate(control, momentum_nms, inputs)
-        actuator_torque_nm = self.control_torque_nm - dump_nm
+            actuator_torque_nm = actuator_torque_nm - dump_nm
         # 3. Allocation.
         achieved_nm = self.actuator.allocate(control, actuator_torque_nm, inputs)
-        self.achieved_nm = achieved_nm + dump_nm
+        self.achieved_nm = achieved_nm + dump_nm if self.momentum_dump else achieved_nm
         for key, motor_commands in commands.motors.items():
             self.actuator_sets[key].command(control, motor_commands, inputs)
         # 4. Anti-windup.

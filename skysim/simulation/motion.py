@@ -443,8 +443,9 @@ class Motion:
             torque_nm=self.flight_computer.control_torque_nm,
             disturbance_nm=disturbance_nm,
             control=self.flight_computer.control,
-            **self.readings,
         )
+        for drive in self.drives:
+            row |= drive.readings
         simulation = self.simulation
         navigation = self.navigation
         if navigation:
@@ -470,12 +471,14 @@ class Motion:
                     ],
                 )
         number = simulation.step // self.period_steps
+        now = slice(number, number + periods)
+        rows = self.rows
         for name, value in row.items():
-            if name not in self.rows:
+            if name not in rows:
                 one = np.asarray(value)
                 count = math.ceil(simulation.last_step / self.period_steps)
-                self.rows[name] = np.zeros((count, *one.shape), one.dtype)
-            self.rows[name][number : number + periods] = value
+                rows[name] = np.zeros((count, *one.shape), one.dtype)
+            rows[name][now] = value
 
     def telemetry(self) -> Telemetry:
         """The rows so far as Telemetry; there is no commanded attitude without a controller."""

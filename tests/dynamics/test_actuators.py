@@ -314,14 +314,14 @@ def test_a_fan_pair_is_a_couple():
     """A newton from each of a pair a meter apart is a newton meter; by hand: y x z = x, z x x = y, x x y = z."""
     for axis in range(3):
         thrust = np.repeat(np.eye(3)[axis], 2)
-        np.testing.assert_array_equal(fans().torque(thrust), np.eye(3)[axis])
+        np.testing.assert_array_equal(fans().torque_from_command @ thrust, np.eye(3)[axis])
 
 
 def test_fans_give_the_torque_with_the_least_thrust():
     set_ = fans()
     torque = np.array([0.1, -0.2, 0.05])
     thrust = set_.drive(torque)
-    np.testing.assert_allclose(set_.torque(thrust), torque, rtol=0, atol=1e-15)
+    np.testing.assert_allclose(set_.torque_from_command @ thrust, torque, rtol=0, atol=1e-15)
     np.testing.assert_allclose(thrust, np.repeat(torque / 2 / 0.5, 2), rtol=1e-13, atol=0)
 
 
@@ -330,7 +330,9 @@ def test_fans_at_their_limit_keep_the_direction():
     torque = np.array([3.0, -2.0, 1.0])
     thrust = set_.drive(torque)
     assert np.abs(thrust).max() == pytest.approx(0.5, rel=1e-15)
-    np.testing.assert_allclose(set_.torque(thrust), torque / 6, rtol=1e-13, atol=0)
+    np.testing.assert_allclose(
+        set_.torque_from_command @ thrust, torque / 6, rtol=1e-13, atol=0
+    )
 
 
 # ---- the geometry of gyros -------------------------------------------------------------------------------------
@@ -665,7 +667,7 @@ def test_fans_empty_the_wheels_while_the_controller_holds_the_body():
     fanned = []
     for _ in range(300):
         held = wheel_momentum(set_, body.speed)
-        outside = blow.torque(blow.drive(fan.torque(held)))
+        outside = blow.torque_from_command @ blow.drive(fan.torque(held))
         feedback = -BUS @ (4 * body.turn + 3.2 * body.rate) + np.cross(body.rate, body.whole)
         body = body.move(
             period, motor=driven_wheels(set_, feedback, body.speed, period), outside=outside

@@ -339,6 +339,30 @@ def test_a_flight_has_the_requested_start_and_duration() -> None:
     np.testing.assert_array_equal(flight.rate_body_rad_s[0], rate)
 
 
+def test_a_flight_by_control_periods_is_that_of_plain_steps() -> None:
+    """To the last bit, also with friction and at the tilt stop: MuJoCo's solver starts from its last solution."""
+    top_heavy = ["0 m", "0 m", "2 cm"]
+    flown = multibody.build(
+        vehicle_config(center_of_mass=top_heavy, wheels={"coulomb": "50 mN m"})
+    )
+    begin = Rotation.from_euler("x", 28, degrees=True)
+    flight = multibody.Simulation(flown, begin, np.radians([40.0, 10.0, 30.0]), 0.5)
+    data = mujoco.MjData(flown.model)
+    data.qpos[:] = flight.angles_rad
+    data.qvel[:] = flight.speeds_rad_s
+    mujoco.mj_forward(flown.model, data)
+    rng = np.random.default_rng(0)
+    most = 0
+    while flight.steps_left:
+        data.ctrl[:] = 0.3 * rng.standard_normal(flown.model.nu)
+        flight.advance(np.tile(data.ctrl, (10, 1)))
+        mujoco.mj_step(flown.model, data, 10)
+        np.testing.assert_array_equal(flight.angles_rad, data.qpos)
+        np.testing.assert_array_equal(flight.speeds_rad_s, data.qvel)
+        most = max(most, data.nefc)
+    assert most == 4  # the friction of three wheels, and the stop
+
+
 def test_the_controller_is_called_every_period_with_the_present_state() -> None:
     """The state passed to the controller is the trajectory's at the time passed with it, not a step older."""
     asked: list[tuple[float, Rotation, np.ndarray]] = []

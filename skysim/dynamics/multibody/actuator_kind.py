@@ -70,17 +70,15 @@ class Actuators:
 
         One factor scales all commands to the limit, which keeps the direction of the torque.
         """
-        return scale_to_limit(self.command_from_torque.dot(torque_nm), self.limit)
+        commands = self.command_from_torque.dot(torque_nm)
+        scale_to_limit(commands, self.limit)
+        return commands
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """The same for commands (n,) of the single motors, each of which is clipped to its limits."""
         control[self.motor] = given = commands.clip(-self.limit, self.limit)
-        return self.torque(given)
-
-    def torque(self, commands: Floats) -> Floats:
-        """Torque (3,) on the body of commands (n,)."""
         # The operator takes twice as long for so few numbers.
-        return self.torque_from_command.dot(commands)
+        return self.torque_from_command.dot(given)
 
 
 class ActuatorDrive(Protocol):
@@ -140,11 +138,11 @@ class ActuatorKind:
 
 
 @jit
-def scale_to_limit(command: Floats, limit: float) -> Floats:
-    """The command, scaled by one factor so that no element exceeds the limit; its direction is kept."""
-    # A command of zeros has no direction to keep.
-    peak = np.abs(command).max()
-    return command * (limit / peak if peak > limit else 1.0)
+def scale_to_limit(commands: Floats, limit: float) -> None:
+    """Scale the commands by one factor, in place, so that none exceeds the limit; their direction is kept."""
+    peak = np.abs(commands).max()
+    if peak > limit:
+        commands *= limit / peak
 
 
 def inverse(torque_from_command: Floats) -> Floats:

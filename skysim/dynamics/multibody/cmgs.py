@@ -261,7 +261,8 @@ class CmgActuator(Actuators):
         if unit_nms:
             steering = STEERING[self.config.steering]
             rate = steering(jacobian / unit_nms, torque_nm / -unit_nms, inputs.t_s)
-        return self.command(control, scale_to_limit(rate, self.limit), inputs)
+        scale_to_limit(rate, self.limit)
+        return self.command(control, rate, inputs)
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         super().command(control, commands, inputs)

@@ -9,6 +9,7 @@ MuJoCo computes the multibody dynamics and integrates them by the fourth-order R
 
 import copy
 from collections.abc import Callable
+from functools import partial
 
 import mujoco
 import numpy as np
@@ -86,7 +87,15 @@ class Simulation:
         self.states = np.empty((rows, mujoco.mj_stateSize(self.model, STATE)))
         self.step = self.first_step = 0
         self.data = mujoco.MjData(self.model)
-        self.rollout = Rollout(nthread=0)
+        # MuJoCo's own memory as the warm start carries the solver's state over from call to call.
+        self.rollout = partial(
+            Rollout(nthread=0).rollout,
+            [self.model],
+            [self.data],
+            control_spec=CONTROL,
+            skip_checks=True,
+            initial_warmstart=self.data.qacc_warmstart[None],
+        )
         # The initial state; wheel speeds, rotor speeds and gimbal angles are those of the scene.
         data = self.data
         data.qpos[:4] = lab_from_body.as_quat(scalar_first=True)
@@ -158,21 +167,15 @@ class Simulation:
     def integrate(self, control: Floats) -> None:
         """Integrate one step for each row of control (K, nu) with MuJoCo's rollout. Raises InputError if it warned."""
         row = self.row
-        end = self.row + len(control)
-        # The warm start carries the solver's state over to this call.
+        steps = len(control)
         with MujocoWarnings() as warned:
-            self.rollout.rollout(
-                [self.model],
-                [self.data],
+            self.rollout(
                 self.states[None, row],
                 control[None],
-                control_spec=CONTROL,
-                skip_checks=True,
-                nstep=len(control),
-                initial_warmstart=self.data.qacc_warmstart[None].copy(),
-                state=self.states[None, row + 1 : end + 1],
+                nstep=steps,
+                state=self.states[None, row + 1 : row + 1 + steps],
             )
-        self.step += len(control)
+        self.step += steps
         if warned:
             # The next call clears MuJoCo's own record.
             kinds = np.flatnonzero(self.data.warning.number).tolist()

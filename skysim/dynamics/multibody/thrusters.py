@@ -193,7 +193,9 @@ class ThrusterActuator(FanSet):
 
     def drive(self, torque_nm: Floats) -> Floats:
         """The thrusts, scaled to the limit by one factor."""
-        return scale_to_limit(self.thrusts(torque_nm), self.limit)
+        thrusts = self.thrusts(torque_nm)
+        scale_to_limit(thrusts, self.limit)
+        return thrusts
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         return super().command(control, np.maximum(commands, 0.0), inputs)

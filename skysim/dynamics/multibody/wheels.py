@@ -58,42 +58,47 @@ class WheelActuator(Actuators):
             hinges.motor, -hinges.axes, motor_from_torque, config.torque_limit_nm
         )
         self.speed_limit_rad_s = config.speed_limit_rpm * RPM_RAD_S
+        self.momentum_from_speed = hinges.axes * hinges.inertia_kg_m2
 
     def command(self, control: Floats, commands: Floats, inputs: ControlInput) -> Floats:
         """Each motor torque is also clipped to what just reaches the speed limit within the period.
 
         By inertia d(speed)/dt = u, without the body's own acceleration. A wheel at its limit can only be braked.
         """
-        given = limit_torques(
+        given = np.empty(len(commands))
+        limit_torques(
             commands,
             inputs.speeds_rad_s[self.hinges.dof],
-            self.hinges.inertia_kg_m2 / inputs.period_s,
+            self.hinges.inertia_kg_m2,
+            inputs.period_s,
             self.limit,
             self.speed_limit_rad_s,
+            given,
         )
         control[self.motor] = given
-        return self.torque(given)
+        return self.torque_from_command.dot(given)
 
     def momentum_nms(self, angles_rad: Floats, speeds_rad_s: Floats) -> Floats:
         """Angular momentum (3,) of the wheels relative to the body: h = sum axis inertia speed."""
-        return self.hinges.axes.dot(self.hinges.inertia_kg_m2 * speeds_rad_s[self.hinges.dof])
+        return self.momentum_from_speed.dot(speeds_rad_s[self.hinges.dof])
 
 
 @jit
 def limit_torques(
     torques_nm: Floats,
     speeds_rad_s: Floats,
-    torque_per_speed: Floats,
+    inertia_kg_m2: Floats,
+    period_s: float,
     torque_limit_nm: float,
     speed_limit_rad_s: float,
-) -> Floats:
-    """(n,) torques of the motors, clipped as in `WheelActuator.command`; torque_per_speed is inertia over period."""
-    given_nm = np.empty(len(torques_nm))
+    given_nm: Floats,
+) -> None:
+    """Set given_nm (n,), the torques of the motors clipped as in `WheelActuator.command`."""
     for n in range(len(torques_nm)):
-        upper = max(torque_per_speed[n] * (speed_limit_rad_s - speeds_rad_s[n]), 0.0)
-        lower = min(-torque_per_speed[n] * (speed_limit_rad_s + speeds_rad_s[n]), 0.0)
+        torque_per_speed = inertia_kg_m2[n] / period_s
+        upper = max(torque_per_speed * (speed_limit_rad_s - speeds_rad_s[n]), 0.0)
+        lower = min(-torque_per_speed * (speed_limit_rad_s + speeds_rad_s[n]), 0.0)
         given_nm[n] = min(max(torques_nm[n], lower, -torque_limit_nm), upper, torque_limit_nm)
-    return given_nm
 
 
 class Stiction:
