@@ -186,7 +186,7 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     assert (groups[:, None] == groups)[near].all()
     alone = ~(near & ~np.eye(len(stars), dtype=bool)).any(axis=1) & (near_rad > 1e-9)
     assert (np.bincount(groups)[groups[alone]] == 1).all() or near_rad < 1e-6
-    _, mag = catalog.light_centers(stars.vectors, stars.v_mag, groups)
+    _, mag = catalog.light_centers(stars.vectors.T, stars.v_mag, groups)
     merged = catalog.merge_doubles(stars, near_rad)
     for magnitudes in (mag, merged.v_mag):
         np.testing.assert_allclose(
