@@ -44,7 +44,8 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
     """Return the quads of a sky for fields of the given height: from their file, else built and written to it."""
     if len(sky.vectors) < FEW_STARS:
         return quad_index.build(sky, height_rad)
-    key = hashlib.sha256(FORM + np.float64(height_rad).tobytes() + sky.vectors.tobytes())
+    key = hashlib.sha256(FORM + np.float64(height_rad).tobytes())
+    key.update(sky.vectors)
     path = folder() / f"quads_{key.hexdigest()}.bin"
     with suppress(OSError, ValueError):
         return read(path)

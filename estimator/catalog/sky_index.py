@@ -295,11 +295,11 @@ def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[Ints32, Floats]:
     pair = cKDTree(vectors).query_pairs(longest, output_type="ndarray").astype(np.int32)
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits. Part by part, as
     # the vectors of all pairs would take six times the memory of the pairs.
-    chord = [
-        lengths(vectors[part[:, 0]] - vectors[part[:, 1]])
+    angle_rad = [
+        2 * np.arcsin(np.minimum(lengths(vectors[part[:, 0]] - vectors[part[:, 1]]) / 2, 1.0))
         for part in np.array_split(pair, 1 + len(pair) // PART)
     ]
-    return pair, 2 * np.arcsin(np.minimum(np.concatenate(chord) / 2, 1.0))
+    return pair, np.concatenate(angle_rad)
 
 
 def _smoothed_histogram(mag: Floats) -> Floats:
