@@ -470,7 +470,7 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
 
 
 def light_centers(
-    columns: Sequence[Floats], magnitude: Floats, group: Ints
+    columns: Floats | list[Floats], magnitude: Floats, group: Ints
 ) -> tuple[Floats, Floats]:
     """Centers of light of groups: means weighted by the flux 10^(-0.4 m).
 

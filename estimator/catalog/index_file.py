@@ -45,7 +45,7 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
     if len(sky.vectors) < FEW_STARS:
         return quad_index.build(sky, height_rad)
     key = hashlib.sha256(FORM + np.float64(height_rad).tobytes())
-    key.update(sky.vectors)
+    key.update(sky.vectors.data)
     path = folder() / f"quads_{key.hexdigest()}.bin"
     with suppress(OSError, ValueError):
         return read(path)

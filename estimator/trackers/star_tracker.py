@@ -193,7 +193,7 @@ class StarTracker(FrameTracker):
 
     def _paired_sky(self) -> sky_index.SkyIndex:
         """Return the index of stars with its pairs, which are added to that of a deep sky on first use."""
-        if not len(self.sky.pair):
+        if not self.sky.pair.size:
             index_file.release()  # makes room for them
             self.sky = sky_index.add_pairs(self.sky, *self._pairs)
         return self.sky

@@ -217,7 +217,6 @@ class Solver:
             if len(tracker.stars) <= most_stars:
                 cached[camera] = tracker
             yield tracker
-            del tracker  # which another one is built beside
 
     def tracker(self, camera: Camera, uncertainty: float) -> StarTracker:
         """A tracker with the brightest stars of the catalog, as many as its narrowest field needs.
