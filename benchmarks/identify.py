@@ -116,7 +116,9 @@ def narrow_command(tracker: StarTracker, folder: Path) -> list[dict[str, Any]]:
     first = used(clean[:1])  # it builds the index
     one = used(clean[:1])
     many = used(clean)
-    refused_mb = used(crowd)[0]
+    refused_mb = [
+        used(crowd)[0] for _ in range(2)
+    ]  # the first one builds the indexes of other fields
     solutions = json.loads((out / "solutions.json").read_text(encoding="utf-8"))
     solved = [found["file"] for found in solutions if found["status"] == "solved"]
     a_frame_s = (many[2] - one[2]) / (COMMAND_FIELDS - 1)
@@ -133,7 +135,8 @@ def narrow_command(tracker: StarTracker, folder: Path) -> list[dict[str, Any]]:
             f"{len(solved)} lists of lights",
             400,
         ),
-        figure(f"{name}: greatest memory, {false}", refused_mb, "MB", refused),
+        figure(f"{name}: greatest memory, {false}", refused_mb[1], "MB", refused),
+        figure(f"{name}: the same, indexes built", refused_mb[0], "MB", refused),
         figure(f"{name}: private memory at the end", many[1], "MB", what),
         figure(f"{name}: greatest memory, index built", first[0], "MB", "1 list"),
         verdict(f"{name}: CPU of a frame", a_frame_s, "s", what, 0.3),
