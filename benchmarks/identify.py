@@ -7,6 +7,7 @@ of tetra3rs takes a minute, and is kept in out/ too.
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import subprocess
 import sys
@@ -98,30 +99,60 @@ def narrow() -> list[dict[str, Any]]:
 
 
 def narrow_command(tracker: StarTracker, folder: Path) -> list[dict[str, Any]]:
-    """Memory and CPU time of `skysim solve` for lists of lights of narrow fields, its index on disk."""
+    """Memory and CPU time of `skysim solve` for lists of lights of narrow fields, its index on disk.
+
+    A refused list is also tried with all other fields of view, whose trackers are built for it.
+    """
+    out = folder / "solved"
+    options = ["--fov", str(NARROW_DEG), "--size", f"{NARROW_PX}x{NARROW_PX}"]
+    options += ["--catalog", str(deep_catalog().resolve()), "--out", str(out)]
+
+    def used(lists: list[str]) -> list[float]:
+        command = [sys.executable, "-c", MEASURED, "solve", *options, *lists]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        return [float(word) for word in done.stdout.splitlines()[-1].split()]
+
+    clean, crowd = (narrow_lists(tracker, folder, share) for share in FALSE_SHARES)
+    first = used(clean[:1])  # it builds the index
+    one = used(clean[:1])
+    many = used(clean)
+    refused_mb = [
+        used(crowd)[0] for _ in range(2)
+    ]  # the first one builds the indexes of other fields
+    solutions = json.loads((out / "solutions.json").read_text(encoding="utf-8"))
+    solved = [found["file"] for found in solutions if found["status"] == "solved"]
+    a_frame_s = (many[2] - one[2]) / (COMMAND_FIELDS - 1)
+    what = f"{COMMAND_FIELDS} lists of lights"
+    false = f"{100 * FALSE_SHARES[1]:.0f} % false lights"
+    name = "2.6 deg to V 10, skysim solve"
+    refused = f"{what}, {len(crowd) - len(solved)} refused"
+    return [
+        verdict(f"{name}: greatest memory", many[0], "MB", what, 400),
+        verdict(
+            f"{name}: greatest memory, {false}, solved",
+            used(solved)[0],
+            "MB",
+            f"{len(solved)} lists of lights",
+            400,
+        ),
+        figure(f"{name}: greatest memory, {false}", refused_mb[1], "MB", refused),
+        figure(f"{name}: the same, indexes built", refused_mb[0], "MB", refused),
+        figure(f"{name}: private memory at the end", many[1], "MB", what),
+        figure(f"{name}: greatest memory, index built", first[0], "MB", "1 list"),
+        verdict(f"{name}: CPU of a frame", a_frame_s, "s", what, 0.3),
+    ]
+
+
+def narrow_lists(tracker: StarTracker, folder: Path, false_share: float) -> list[str]:
+    """Files of lights of narrow fields, with a share of false lights."""
     lists = []
     for n in range(COMMAND_FIELDS):
         rng = np.random.default_rng([4, n])
-        seen = crowded(tracker, Rotation.random(rng=rng), 0.0, rng)
+        seen = crowded(tracker, Rotation.random(rng=rng), false_share, rng)
         table = np.column_stack([seen.xy_px, seen.flux])
-        lists.append(str(folder / f"{n}.csv"))
+        lists.append(str(folder / f"{n}_{100 * false_share:.0f}.csv"))
         np.savetxt(lists[-1], table, delimiter=",", header="x_px,y_px,flux", comments="")
-    options = ["--fov", str(NARROW_DEG), "--size", f"{NARROW_PX}x{NARROW_PX}"]
-    options += ["--catalog", str(deep_catalog().resolve()), "--out", str(folder / "solved")]
-    used = []
-    for few in (1, 1, COMMAND_FIELDS):  # the first one builds the index
-        command = [sys.executable, "-c", MEASURED, "solve", *options, *lists[:few]]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        used.append([float(word) for word in done.stdout.splitlines()[-1].split()])
-    a_frame_s = (used[2][2] - used[1][2]) / (COMMAND_FIELDS - 1)
-    what = f"{COMMAND_FIELDS} lists of lights"
-    name = "2.6 deg to V 10, skysim solve"
-    return [
-        verdict(f"{name}: greatest memory", used[2][0], "MB", what, 400),
-        figure(f"{name}: private memory at the end", used[2][1], "MB", what),
-        figure(f"{name}: greatest memory, index built", used[0][0], "MB", "1 list"),
-        verdict(f"{name}: CPU of a frame", a_frame_s, "s", what, 0.3),
-    ]
+    return lists
 
 
 def narrow_times(tracker: StarTracker, false_share: float) -> list[dict[str, Any]]:

@@ -128,8 +128,8 @@ class StarCatalog:
             )
         return from_columns(numbers, ra, dec, *others, epoch_yr=epoch_yr).brightest_first()
 
-    def take(self, which: NDArray) -> StarCatalog:
-        """Select stars by mask or index."""
+    def take(self, which: NDArray | slice) -> StarCatalog:
+        """Select stars by mask, index or slice; a slice shares the memory."""
         columns = [name for name in self.__dataclass_fields__ if name != "epoch_yr"]
         return replace(self, **{name: getattr(self, name)[which] for name in columns})
 
@@ -454,8 +454,8 @@ def apparent(stars: StarCatalog, observer: Observer) -> Floats:
 def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     """Replace each group of unresolved stars by one star at their center of light, with their total flux."""
     groups = close_groups(stars.vectors, 2 * np.sin(closer_than_rad / 2))
-    values = np.column_stack([stars.vectors, stars.drift_rad_yr, stars.parallax_rad])
-    means, v_mag = light_centers(values, stars.v_mag, groups)
+    columns = [*stars.vectors.T, *stars.drift_rad_yr.T, stars.parallax_rad]
+    means, v_mag = light_centers(columns, stars.v_mag, groups)
     # Stars are sorted by brightness, so the first of each group is its brightest and gives the id.
     _, first = np.unique(groups, return_index=True)
     result = StarCatalog(
@@ -469,13 +469,15 @@ def merge_doubles(stars: StarCatalog, closer_than_rad: float) -> StarCatalog:
     return result.brightest_first()
 
 
-def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Floats, Floats]:
+def light_centers(
+    columns: Floats | list[Floats], magnitude: Floats, group: Ints
+) -> tuple[Floats, Floats]:
     """Centers of light of groups: means weighted by the flux 10^(-0.4 m).
 
     Parameters
     ----------
-    values
-        (N, K) values of the stars
+    columns
+        K columns of values of the stars, (N,) each
     magnitude
         (N,) their magnitudes
     group
@@ -490,9 +492,9 @@ def light_centers(values: Floats, magnitude: Floats, group: Ints) -> tuple[Float
     """
     flux = 10 ** (-0.4 * magnitude)
     total = np.bincount(group, flux)
-    means = np.column_stack(
-        [np.bincount(group, flux * column) / total for column in values.T]
-    )
+    means = np.empty((len(total), len(columns)))
+    for k, column in enumerate(columns):
+        means[:, k] = np.bincount(group, flux * column) / total
     return means, -2.5 * np.log10(total)
 
 
@@ -513,11 +515,11 @@ def close_groups(points: Floats, distance: float) -> Ints:
 
 
 def brighter_than(stars: StarCatalog, limit_mag: float) -> StarCatalog:
-    """Select the stars down to a limiting V magnitude."""
-    return stars.take(stars.v_mag <= limit_mag)
+    """Select the stars down to a limiting V magnitude: the first ones, without a copy."""
+    return stars.take(slice(np.searchsorted(stars.v_mag, limit_mag, "right")))
 
 
 def limit_for_density(stars: StarCatalog, field_sr: float, mean_count: float) -> float:
     """The limiting magnitude at which a field of `field_sr` steradians holds `mean_count` stars on average."""
     count = int(np.clip(mean_count * 4 * np.pi / field_sr, 1, len(stars)))
-    return float(np.sort(stars.v_mag)[count - 1])
+    return float(stars.v_mag[count - 1])

@@ -11,11 +11,13 @@ The folder is ESTIMATOR_CACHE_DIR, or else `estimator` in XDG_CACHE_HOME or in ~
 """
 
 import hashlib
+import mmap
 import os
 import tempfile
 import zlib
 from contextlib import suppress
 from pathlib import Path
+from weakref import ref
 
 import numpy as np
 
@@ -28,6 +30,7 @@ FORM = b"quads 1"
 FEW_STARS = 50_000
 MOST_FILES = 8
 HEAD = SIDE**4 + 1  # words of `first`
+MAPPED: list[ref[mmap.mmap]] = []
 WHOLE_CRC = 0x2144DF1C  # CRC-32 of any bytes followed by their CRC-32, the low byte first
 
 
@@ -41,7 +44,8 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
     """Return the quads of a sky for fields of the given height: from their file, else built and written to it."""
     if len(sky.vectors) < FEW_STARS:
         return quad_index.build(sky, height_rad)
-    key = hashlib.sha256(FORM + np.float64(height_rad).tobytes() + sky.vectors.tobytes())
+    key = hashlib.sha256(FORM + np.float64(height_rad).tobytes())
+    key.update(sky.vectors.data)
     path = folder() / f"quads_{key.hexdigest()}.bin"
     with suppress(OSError, ValueError):
         return read(path)
@@ -63,6 +67,13 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
     return built
 
 
+def release() -> None:
+    """Give the pages of all mapped files back. They count as memory, and are mapped again where they are read."""
+    for mapped in MAPPED:
+        if pages := mapped():
+            pages.madvise(mmap.MADV_DONTNEED)
+
+
 def read(path: Path) -> QuadIndex:
     """Map a file into memory. Raises OSError or ValueError if there is none, or if it is damaged."""
     crc = 0
@@ -71,7 +82,9 @@ def read(path: Path) -> QuadIndex:
         while part := file.read(2**20):
             crc = zlib.crc32(part, crc)
         # Copy on write: compiled code has one version, for arrays that can be written.
-        words = np.asarray(np.memmap(file, np.int32, "c"))
+        pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    MAPPED.append(ref(pages))
+    words = np.frombuffer(pages, np.int32)
     if len(words) <= HEAD or crc != WHOLE_CRC:
         raise ValueError(f"{path}: damaged")
     star, code = words[HEAD:-1].reshape(2, -1, 4)

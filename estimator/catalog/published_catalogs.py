@@ -131,7 +131,7 @@ def proc_cat(stars: OnBoard, closer_than_rad: float) -> OnBoard:
     vectors = stars.vectors[order]
     magnitude = stars.magnitude[order]
     groups = catalog.close_groups(vectors, 2 * np.sin(closer_than_rad / 2))
-    means, merged = catalog.light_centers(vectors, magnitude, groups)
+    means, merged = catalog.light_centers(vectors.T, magnitude, groups)
     _, first = np.unique(groups, return_index=True)  # the brightest of each group
     components = np.bincount(groups, stars.components[order]).astype(np.int64)
     by_light = np.argsort(merged, kind="stable")

@@ -31,6 +31,7 @@ from estimator.catalog.sky_index import (
     SkyIndex,
     build_grid,
     cell_of,
+    chord_of,
     counting_sort,
     within,
 )
@@ -79,12 +80,12 @@ def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
     share = min(MOST_CIRCLES * height_rad * height_rad / 16, 1.0)
     count = max(PER_CIRCLE * share**0.25, LEAST_PER_CIRCLE)
     cells = Cells(sky.side, sky.cell_first, sky.cell_star)
-    row = _locally_bright(cells, sky.vectors, _chord(height_rad / 2), count)
+    row = _locally_bright(cells, sky.vectors, chord_of(height_rad / 2), count)
     chosen = sky.vectors[row]
     cells = build_grid(chosen)
     # 2. Quads: the first pass only counts them.
     total = 0
-    bounds = _chord(LONGEST * height_rad), SHORTEST * height_rad
+    bounds = chord_of(LONGEST * height_rad), SHORTEST * height_rad
     for _ in range(2):
         found = np.empty((total, 4), np.int32)
         code = np.empty((total, 4), np.float32)
@@ -92,11 +93,6 @@ def build(sky: SkyIndex, height_rad: float) -> QuadIndex:
     # 3. Cells.
     first, order = counting_sort(_grid_cells(code), SIDE**4)
     return QuadIndex(row[found[order]], code[order], first)
-
-
-def _chord(angle_rad: float) -> float:
-    """Chord of an angle; that of half a turn for greater ones."""
-    return float(2 * np.sin(min(angle_rad, np.pi) / 2))
 
 
 @jit

@@ -1,6 +1,6 @@
 """Sky index for star identification: star pairs binned by separation, and stars binned by direction.
 
-Pairs (`build`) are sorted into bins of equal width in angle, so that the candidates for a measured angle are the pairs
+Pairs (`add_pairs`) are sorted into bins of equal width in angle, so that the candidates for a measured angle are those
 of a few adjacent bins:
 
 1. Find all pairs (`close_pairs`).
@@ -231,15 +231,20 @@ class SkyIndex(NamedTuple):
     side: int
 
 
-def build(
-    vectors: Floats, mag: Floats, max_angle_rad: float, paired: int | None = None
-) -> SkyIndex:
-    """Build the index of (N, 3) unit vectors, brightest first, with all pairs up to an angle.
+def build(vectors: Floats, mag: Floats) -> SkyIndex:
+    """Build the index of (N, 3) unit vectors, brightest first, and (N,) magnitudes; without pairs (`add_pairs`)."""
+    vectors = np.ascontiguousarray(vectors, dtype=float)
+    mag = np.ascontiguousarray(mag, dtype=float)
+    no_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
+    side, first, row = build_grid(vectors)
+    return SkyIndex(vectors, *no_pairs, mag, _smoothed_histogram(mag), first, row, side)
+
+
+def add_pairs(sky: SkyIndex, max_angle_rad: float, paired: int | None = None) -> SkyIndex:
+    """Return the index with all pairs up to an angle.
 
     Parameters
     ----------
-    mag
-        (N,) magnitudes, increasing
     max_angle_rad
         Greatest angle of a pair
     paired
@@ -250,15 +255,9 @@ def build(
     ImageError
         For fewer than 3 pairs.
     """
-    sky = build_without_pairs(vectors, mag)
     max_angle_rad = min(max_angle_rad, np.pi)
-    # A uniform sky of N stars has N^2 / 2 pairs, the share sin^2(angle / 2) of them up to an angle.
-    share = np.sin(max_angle_rad / 2) ** 2 / 2
-    vectors = sky.vectors[:paired]
-    if len(vectors) ** 2 * share > MOST_PAIRS:
-        vectors = vectors[: int(np.sqrt(MOST_PAIRS / share))]
     # 1. Find the pairs.
-    pair, angle_rad = close_pairs(vectors, max_angle_rad)
+    pair, angle_rad = close_pairs(_paired(sky.vectors[:paired], max_angle_rad), max_angle_rad)
     # 2. Sort them into bins; the width leaves the greatest angle in the last bin, whatever the rounding.
     bins = max(len(pair) // PAIRS_PER_BIN, 1)
     bin_rad = max_angle_rad * (1 + 1e-9) / bins
@@ -270,26 +269,37 @@ def build(
     return sky._replace(pair=pair[order], first=first, bin_rad=bin_rad)
 
 
+def count_pairs(vectors: Floats, max_angle_rad: float) -> int:
+    """The number of pairs that `add_pairs` would add of stars, (N, 3), without the time and memory that they take."""
+    tree = cKDTree(_paired(vectors, max_angle_rad))
+    return (tree.count_neighbors(tree, chord_of(max_angle_rad)) - tree.n) // 2
+
+
+def _paired(vectors: Floats, max_angle_rad: float) -> Floats:
+    """The first, brightest, of (N, 3) unit vectors: those that form pairs up to an angle."""
+    # A uniform sky of N stars has N^2 / 2 pairs, the share sin^2(angle / 2) of them up to an angle.
+    share = (chord_of(max_angle_rad) / 2) ** 2 / 2
+    if len(vectors) ** 2 * share > MOST_PAIRS:
+        vectors = vectors[: int(np.sqrt(MOST_PAIRS / share))]
+    return vectors
+
+
+def chord_of(angle_rad: float) -> float:
+    """Chord of an angle; that of half a turn for greater ones."""
+    return float(2 * np.sin(min(angle_rad, np.pi) / 2))
+
+
 def close_pairs(vectors: Floats, max_angle_rad: float) -> tuple[Ints32, Floats]:
     """The (P, 2) rows of all pairs of (N, 3) unit vectors up to an angle, and their (P,) angles."""
-    longest = 2 * np.sin(min(max_angle_rad, np.pi) / 2)
+    longest = chord_of(max_angle_rad)
     pair = cKDTree(vectors).query_pairs(longest, output_type="ndarray").astype(np.int32)
     # The half-chord keeps small angles exact where arccos of a dot product would lose half the digits. Part by part, as
     # the vectors of all pairs would take six times the memory of the pairs.
-    chord = [
-        lengths(vectors[part[:, 0]] - vectors[part[:, 1]])
+    angle_rad = [
+        2 * np.arcsin(np.minimum(lengths(vectors[part[:, 0]] - vectors[part[:, 1]]) / 2, 1.0))
         for part in np.array_split(pair, 1 + len(pair) // PART)
     ]
-    return pair, 2 * np.arcsin(np.minimum(np.concatenate(chord) / 2, 1.0))
-
-
-def build_without_pairs(vectors: Floats, mag: Floats) -> SkyIndex:
-    """Build the index of (N, 3) unit vectors, brightest first, without pairs: for look-ups by direction only."""
-    vectors = np.ascontiguousarray(vectors, dtype=float)
-    mag = np.ascontiguousarray(mag, dtype=float)
-    no_pairs = np.empty((0, 2), np.int32), np.zeros(2, np.int32), np.pi
-    side, first, row = build_grid(vectors)
-    return SkyIndex(vectors, *no_pairs, mag, _smoothed_histogram(mag), first, row, side)
+    return pair, np.concatenate(angle_rad)
 
 
 def _smoothed_histogram(mag: Floats) -> Floats:

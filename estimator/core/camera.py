@@ -172,6 +172,11 @@ class Camera:
         return float(2 * np.arctan(half / self.focal_px))
 
     @property
+    def field_sr(self) -> float:
+        """Solid angle of a small field of view."""
+        return self.width_px * self.height_px / self.focal_px**2
+
+    @property
     def corners_px(self) -> Floats:
         """(4, 2) corners of the sensor, half a pixel beyond the centers of its corner pixels."""
         right = self.width_px - 0.5

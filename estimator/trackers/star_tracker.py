@@ -143,30 +143,30 @@ class StarTracker(FrameTracker):
         self.stars = catalog.merge_doubles(
             replace(stars, vectors=vectors), settings.merge_px / camera.focal_px
         )
-        paired = int(min(settings.field_stars * 4 * np.pi / self._field_sr, len(self.stars)))
+        paired = int(min(settings.field_stars * 4 * np.pi / camera.field_sr, len(self.stars)))
         # Of so many stars not all pairs are indexed, and a separation has hundreds of candidates.
         self.deep = paired >= index_file.FEW_STARS
         calibrated = DEEP_SEARCHES if self.deep else CALIBRATED_SEARCHES
         self.searches = searches or (
             UNCALIBRATED_SEARCHES if focal_uncertainty else calibrated
         )
-        places = self.stars.vectors, self.stars.v_mag
         # Longest pair: the diagonal of the widest field that the camera may have
         longest_rad = 1.02 * camera.zoomed(1 - focal_uncertainty).diagonal_rad
         if all(model.by_quads for model in self.searches):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
-        if default:
-            self.sky = sky_index.build(*places, longest_rad, paired)
-            patterns = len(self.sky.pair)
-        else:
-            self.sky = sky_index.build_without_pairs(*places)
+        self.sky = sky_index.build(self.stars.vectors, self.stars.v_mag)
+        self._pairs = longest_rad, paired
+        bright = self.sky.vectors[:paired]
+        if not default:
             unknown = settings.zero_point_mag is None
-            bright, magnitude = (part[:paired] for part in places)
-            self.index = pair_index.build(
-                bright, longest_rad, magnitude=None if unknown else magnitude
-            )
+            magnitude = None if unknown else self.sky.mag[:paired]
+            self.index = pair_index.build(bright, longest_rad, magnitude=magnitude)
             patterns = len(self.index.pair)
+        elif self.deep:
+            patterns = sky_index.count_pairs(bright, longest_rad)
+        else:
+            patterns = len(self._paired_sky().pair)
         self.field_matcher = FieldMatcher(camera, self.stars, focal_uncertainty, patterns)
 
     @functools.cached_property
@@ -191,10 +191,12 @@ class StarTracker(FrameTracker):
         """Quads of the stars that form pairs, built on first use."""
         return index_file.quads(self.sky, self._height_rad)
 
-    @property
-    def _field_sr(self) -> float:
-        """Solid angle of the field of view."""
-        return self.camera.width_px * self.camera.height_px / self.camera.focal_px**2
+    def _paired_sky(self) -> sky_index.SkyIndex:
+        """Return the index of stars with its pairs, which are added to that of a deep sky on first use."""
+        if not self.sky.pair.size:
+            index_file.release()  # makes room for them
+            self.sky = sky_index.add_pairs(self.sky, *self._pairs)
+        return self.sky
 
     @property
     def _height_rad(self) -> float:
@@ -402,7 +404,7 @@ class StarTracker(FrameTracker):
             if attitude.solved:
                 return attitude
         clock.lap("identify")
-        in_field = len(index.vectors) * self._field_sr / (4 * np.pi)
+        in_field = len(index.vectors) * self.camera.field_sr / (4 * np.pi)
         why = advice(
             settings.identifier,
             len(bright),
@@ -524,7 +526,7 @@ class StarTracker(FrameTracker):
         A refusal of all searches says whether another scale would be solved.
         """
         camera = self.camera
-        stars = len(self.stars) * self._field_sr / (4 * np.pi)
+        stars = len(self.stars) * self.camera.field_sr / (4 * np.pi)
         most = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * stars))
         lights = lights_of(centroids, camera.width_px, camera.height_px, most)
         attitude = self._identify_by_evidence(lights.centroids, clock, effort)
@@ -604,7 +606,9 @@ class StarTracker(FrameTracker):
             and misfit.are_small(sigma_px / self.camera.focal_px)
         ):
             lights = flat_centroids(centroids, sigma_px)
-            solution, variance = misfit.identify(lights, self.sensor, self.sky, *effort)
+            solution, variance = misfit.identify(
+                lights, self.sensor, self._paired_sky(), *effort
+            )
             exact = model.min_error_px == MIN_ERROR_PX or bool(model.relative_error)
             if exact or not len(solution.star):
                 return solution, variance
@@ -618,7 +622,7 @@ class StarTracker(FrameTracker):
             return misfit.widened(solution, R_cam_from_ref, claimed, self.sky)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:
-            return star_search.lost_in_space(detections, self.sky, *effort), 0.0
+            return star_search.lost_in_space(detections, self._paired_sky(), *effort), 0.0
         detections = detections._replace(tangent=detections.tangent / [1.0, model.aspect])
         quads = self.quads, self.sky
         return star_quads.identify(

@@ -17,7 +17,7 @@ from scipy.stats import chi2
 import skysim
 from skysim.apps import plate_solver
 from skysim.apps.cli import main
-from skysim.apps.plate_solver.plate_solution import dome_fields, solve_dome
+from skysim.apps.plate_solver.plate_solution import DomeSolution, dome_fields, solve_dome
 from skysim.core.errors import InputError
 from skysim.core.images import ViewedImage
 from skysim.experiments.dome_survey import survey_frames
@@ -90,7 +90,7 @@ def test_attitudes_err_as_their_covariance_says_where_the_dome_differs_from_its_
     nees = []
     for frame, truth in survey_frames.render_stops(true, held):
         reading = solve_dome(ViewedImage(frame.image_dn), solver)
-        found = plate_solver.DomeSolution(**dome_fields(reading))
+        found = DomeSolution(**dome_fields(reading))
         if found.status == "solved":
             turn = Rotation.from_quat(found.cam_from_lab_xyzw) * truth.cam_from_lab.inv()
             error_rad = turn.as_rotvec()

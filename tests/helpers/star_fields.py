@@ -23,7 +23,7 @@ def random_sky(count: int, seed: int):
 
 
 VECTORS, MAG = random_sky(6000, 1)
-SKY = sky_index.build(VECTORS, MAG, WIDE_RAD)
+SKY = sky_index.add_pairs(sky_index.build(VECTORS, MAG), WIDE_RAD)
 
 
 def observe(truth: Rotation, rng, sigma=SIGMA, zoom=1.0, vectors=VECTORS, mag=MAG):

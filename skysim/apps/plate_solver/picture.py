@@ -10,10 +10,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimator.catalog import index_file
 from estimator.core.errors import ImageError
 from estimator.core.types import Centroids
 from estimator.detection.detect import check_size
-from estimator.trackers.pipeline import Clock, Report
+from estimator.trackers.pipeline import Report
 from estimator.trackers.star_tracker import StarTracker
 from skysim.apps.plate_solver import diagnosis
 from skysim.apps.plate_solver.plate_solution import (
@@ -38,7 +39,6 @@ from skysim.apps.plate_solver.solver import (
     kept_solver,
     make_solver,
     solve_array,
-    solve_centroids,
     validated_date,
 )
 from skysim.core import files, images
@@ -256,6 +256,8 @@ def read_and_solve(
         raise error if error.key == printable(path) else error.within(path) from None
     except ImageError as error:
         raise InputError(path, error) from None
+    finally:
+        index_file.release()
     result["time_ms"] = 1e3 * (time.perf_counter() - begin)
     result["bad_input"] = False
     if isinstance(reading, DomeReading):
@@ -313,10 +315,8 @@ def solve_list(path: Path, centroids: Centroids, solver: Solver) -> SolvedReadin
             "a list of lights of a picture of unknown size",
             "a size in pixels, or a camera",
         )
-    begin = Clock()
-    attitude, tracker = solve_centroids(centroids, solver, size_px, begin)
-    report = Report(attitude, centroids, begin.seconds)
     reading = Reading(np.zeros(size_px[::-1], np.uint8), solver)
+    report, tracker = solve_array(reading.pixels, solver, centroids)
     return SolvedReading(reading, report, tracker, [reading])
 
 

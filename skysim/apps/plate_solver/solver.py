@@ -28,8 +28,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from estimator.catalog import catalog as star_catalog
+from estimator.catalog import index_file
 from estimator.core.camera import Camera
-from estimator.core.checks import Floats
 from estimator.core.errors import ImageError
 from estimator.core.types import Attitude, Centroids
 from estimator.detection.classify import NO_STAR
@@ -41,7 +41,7 @@ from estimator.trackers.star_tracker import StarTracker
 from skysim.core.errors import InputError, check_name, refusing
 from skysim.core.paths import CATALOGS
 from skysim.core.time import check_year
-from skysim.core.types import Array, Bools, frozen
+from skysim.core.types import Array, frozen
 
 if TYPE_CHECKING:
     from skysim.scene.sections.camera import DetectorConfig
@@ -56,7 +56,7 @@ FOV_LIMITS_DEG = 1.0, 120.0
 CATALOG = CATALOGS / "gaia_v8.0.ecsv"
 PHOTOGRAPH = Settings(reject=NO_STAR)  # text and trees are no stars
 THREADS = min(os.cpu_count() or 1, 8)
-DEFAULT_EPOCH = datetime(2020, 1, 1, 12)
+DEFAULT_EPOCH_YR = 2020.0
 
 
 Circle = tuple[float, float, float]  # right ascension, declination and radius, degrees
@@ -188,7 +188,8 @@ class Solver:
             camera = Camera.from_fov(width_px, height_px, math.radians(self.fov_deg))
             return [(camera, self.fov_uncertainty)]
         cameras = search_cameras(width_px, height_px)
-        return [one for one in cameras if self.mean_stars(one[0]) >= LEAST_STARS]
+        least_sr = 4 * math.pi * LEAST_STARS / len(self.stars)
+        return [one for one in cameras if one[0].field_sr >= least_sr]
 
     def tried_fov_deg(self, width_px: int, height_px: int) -> tuple[float, float]:
         """Narrowest and widest horizontal field that is tried for this image size."""
@@ -200,64 +201,44 @@ class Solver:
         ]
         return min(ends), max(ends)
 
-    def trackers(self, width_px: int, height_px: int) -> Iterator[StarTracker]:
+    def trackers(
+        self, width_px: int, height_px: int, most_stars: float = math.inf
+    ) -> Iterator[StarTracker]:
         """Yield the trackers for an image of this size: one, or one per range of fields of view.
 
-        Trackers are built when first needed and cached until an image of another size or date comes.
+        Trackers of up to `most_stars` stars are cached until an image of another size or date comes.
         """
         key = width_px, height_px, self.time_utc
         if key not in self.tracker_cache:
             self.tracker_cache.clear()  # keep the trackers of one image size and date only
         cached = self.tracker_cache.setdefault(key, {})
-        vectors = None
-        for camera, uncertainty in self.candidate_cameras(width_px, height_px):
-            if (camera, uncertainty) not in cached:
-                vectors = self.vectors() if vectors is None else vectors
-                cached[camera, uncertainty] = self.tracker(camera, vectors, uncertainty)
-            yield cached[camera, uncertainty]
+        for camera in self.candidate_cameras(width_px, height_px):
+            tracker = cached.get(camera) or self.tracker(*camera)
+            if len(tracker.stars) <= most_stars:
+                cached[camera] = tracker
+            yield tracker
 
-    def mean_stars(self, camera: Camera) -> float:
-        """Mean number of catalog stars in the field of a camera."""
-        return (
-            len(self.stars)
-            * camera.width_px
-            * camera.height_px
-            / camera.focal_px**2
-            / (4 * math.pi)
-        )
+    def tracker(self, camera: Camera, uncertainty: float) -> StarTracker:
+        """A tracker with the brightest stars of the catalog, as many as its narrowest field needs.
 
-    def vectors(self) -> Floats:
-        """(N, 3) directions of the stars as seen from the Earth at the solver's time, or at the default epoch."""
+        Their directions are those seen from the Earth at the solver's time, or those at the default epoch. With
+        `near_deg` it has only those that a picture can show whose center is in the circle.
+        """
+        field_sr = camera.zoomed(1 + uncertainty).field_sr
+        limit_mag = star_catalog.limit_for_density(self.stars, field_sr, STARS)
+        stars = star_catalog.brighter_than(self.stars, limit_mag)
         if self.time_utc is None:
-            return star_catalog.at_epoch(self.stars, DEFAULT_EPOCH.year)
-        return star_catalog.apparent(self.stars, star_catalog.on_earth(self.time_utc))
-
-    def within_reach(self, camera: Camera, vectors: Floats) -> Bools:
-        """(N,) which directions a picture can show whose center is in the circle of `near_deg`."""
-        if self.near_deg is None:
-            return np.ones(len(vectors), bool)
-        ra, dec, radius = np.radians(self.near_deg)
-        center = np.array([np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)])
-        reach = min(radius + camera.diagonal_rad / 2, np.pi)
-        return np.asarray(vectors @ center >= np.cos(reach))
-
-    def tracker(self, camera: Camera, vectors: Floats, uncertainty: float) -> StarTracker:
-        """A tracker with the brightest stars of the catalog, as many as its narrowest field needs."""
-        narrowest = camera.zoomed(1 + uncertainty)
-        field_sr = camera.width_px * camera.height_px / narrowest.focal_px**2
-        bright = self.stars.v_mag <= star_catalog.limit_for_density(
-            self.stars, field_sr, STARS
-        )
-        bright &= self.within_reach(camera.zoomed(1 - uncertainty), vectors)
+            vectors = star_catalog.at_epoch(stars, DEFAULT_EPOCH_YR)
+        else:
+            vectors = star_catalog.apparent(stars, star_catalog.on_earth(self.time_utc))
+        if self.near_deg is not None:
+            ra, dec, radius = np.radians(self.near_deg)
+            reach = radius + camera.zoomed(1 - uncertainty).diagonal_rad / 2
+            near = vectors @ star_catalog.from_angles(ra, dec) >= np.cos(min(reach, np.pi))
+            stars = stars.take(near)
+            vectors = vectors[near]
         searches = () if self.field_is_known else QUAD_SEARCHES
-        return StarTracker(
-            camera,
-            self.stars.take(bright),
-            vectors[bright],
-            self.settings,
-            uncertainty,
-            searches,
-        )
+        return StarTracker(camera, stars, vectors, self.settings, uncertainty, searches)
 
 
 def make_solver(
@@ -498,6 +479,7 @@ def attitudes(
         while running:
             future, tracker = running.popleft()
             yield future.result(), tracker
+            index_file.release()
             running.extend(islice(begun, 1))
     finally:
         pool.shutdown(cancel_futures=True)

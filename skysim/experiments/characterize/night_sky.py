@@ -406,12 +406,9 @@ def find_lens(
         ]
     camera = calibration(config)
     stars = onboard_catalog("characterize.night", CATALOG)
-    narrow_sr = (
-        config.width_px * config.height_px / (camera.focal_px * (1 + FOCAL_UNCERTAINTY)) ** 2
-    )
-    stars = stars.take(
-        stars.v_mag <= catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD)
-    )
+    narrow_sr = camera.zoomed(1 + FOCAL_UNCERTAINTY).field_sr
+    limit_mag = catalog.limit_for_density(stars, narrow_sr, STARS_A_FIELD)
+    stars = catalog.brighter_than(stars, limit_mag)
     dates = [one.date_utc for one in frames if one.date_utc is not None]
     vectors = (
         catalog.apparent(stars, catalog.on_earth(dates[0]))

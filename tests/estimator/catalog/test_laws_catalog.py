@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from dataclasses import replace
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -186,7 +187,7 @@ def test_merged_stars_keep_their_light(rng: np.random.Generator, near_rad: float
     assert (groups[:, None] == groups)[near].all()
     alone = ~(near & ~np.eye(len(stars), dtype=bool)).any(axis=1) & (near_rad > 1e-9)
     assert (np.bincount(groups)[groups[alone]] == 1).all() or near_rad < 1e-6
-    _, mag = catalog.light_centers(stars.vectors, stars.v_mag, groups)
+    _, mag = catalog.light_centers(stars.vectors.T, stars.v_mag, groups)
     merged = catalog.merge_doubles(stars, near_rad)
     for magnitudes in (mag, merged.v_mag):
         np.testing.assert_allclose(
@@ -257,7 +258,9 @@ def test_a_prepared_catalog_counts_every_star(
     pair_index.k_vector,
     sky_index.build_grid,
     sky_index.build,
-    sky_index.build_without_pairs,
+    sky_index.add_pairs,
+    sky_index.count_pairs,
+    sky_index.chord_of,
     sky_index.close_pairs,
 )
 @given(rng=SEEDS, most_rad=some.floats(0.3, 3.2), count=some.integers(8, 50))
@@ -272,9 +275,11 @@ def test_both_indexes_hold_the_existing_pairs(
     expected = apart(vectors, vectors)[tuple(pair.T)]
     np.testing.assert_allclose(angle_rad, expected, rtol=0, atol=1e-7)
     assert len(pair) == pairs
+    bare = sky_index.build(vectors, mag)
+    assert sky_index.count_pairs(vectors, most_rad) == pairs
     for build in (
         pair_index.build,
-        lambda *arguments: sky_index.build(arguments[0], mag, arguments[1]),
+        lambda *arguments: sky_index.add_pairs(bare, arguments[1]),
     ):
         made = answered(lambda: build(vectors, most_rad), ImageError)  # noqa: B023
         assert (len(made.pair) if made else 0) == (pairs if pairs >= 3 else 0)
@@ -287,8 +292,27 @@ def test_both_indexes_hold_the_existing_pairs(
     kvector, slope, offset = pair_index.k_vector(np.sort(every))
     z = slope * np.arange(len(kvector)) + offset
     assert all(np.count_nonzero(every <= at) == n for at, n in zip(z, kvector, strict=True))
-    bare = sky_index.build_without_pairs(vectors, mag)
     assert set(bare.cell_star.tolist()) == set(range(count))
+
+
+@law(sky_index.count_pairs, sky_index.add_pairs, sky_index.chord_of)
+@given(rng=SEEDS, most_rad=some.floats(0.3, 4), paired=some.none() | some.integers(8, 50))
+def test_pairs_are_counted_without_them_and_their_number_is_limited(
+    rng: np.random.Generator, most_rad: float, paired: int | None
+) -> None:
+    vectors = units(rng, 50)
+    sky = sky_index.build(vectors, np.sort(rng.uniform(0, 6, 50)))
+    assert not len(sky.pair)
+    with patch.object(sky_index, "MOST_PAIRS", 300):
+        count = sky_index.count_pairs(vectors[:paired], most_rad)
+        made = answered(lambda: sky_index.add_pairs(sky, most_rad, paired), ImageError)
+        assert count == len(made.pair) if made else count < 3
+        # Of a uniform sky, the brightest have about as many as the limit.
+        assert count < 600
+        assert not made or made.pair.max() < (paired or 50)
+    chord = np.linalg.norm(np.array([1, 0]) - [np.cos(most_rad), np.sin(most_rad)])
+    expected = chord if most_rad < np.pi else 2
+    np.testing.assert_allclose(sky_index.chord_of(most_rad), expected, rtol=0, atol=1e-12)
 
 
 @law(pair_index.build)
@@ -306,7 +330,7 @@ def test_quads_are_of_four_stars_and_by_their_cell(
     rng: np.random.Generator, count: int, height_rad: float
 ) -> None:
     index = quad_index.build(
-        sky_index.build(units(rng, count), np.sort(rng.uniform(0, 6, count)), 3.2), height_rad
+        sky_index.build(units(rng, count), np.sort(rng.uniform(0, 6, count))), height_rad
     )
     assert len(index.star) == len(index.code) == index.first[-1]
     assert all(len(set(star)) == 4 for star in index.star.tolist())

@@ -1,5 +1,6 @@
 """The index of quads on disk: what is read is what was built, whatever has happened to the file."""
 
+import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from unittest.mock import patch
@@ -28,7 +29,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def random_sky(rng: np.random.Generator, count: int = 60) -> SkyIndex:
     vectors = rng.standard_normal((count, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    return sky_index.build_without_pairs(vectors, np.linspace(0, 6, count))
+    return sky_index.build(vectors, np.linspace(0, 6, count))
 
 
 def assert_same(one: QuadIndex, other: QuadIndex) -> None:
@@ -39,7 +40,7 @@ def assert_same(one: QuadIndex, other: QuadIndex) -> None:
         assert (first.dtype, first.flags.behaved) == (second.dtype, second.flags.behaved)
 
 
-@law(index_file.quads, index_file.read, index_file.folder)
+@law(index_file.quads, index_file.read, index_file.folder, index_file.release)
 @given(rng=SEEDS, height_rad=some.floats(0.3, 1.2))
 def test_the_second_start_reads_what_the_first_one_built(
     rng: np.random.Generator, height_rad: float
@@ -51,6 +52,28 @@ def test_the_second_start_reads_what_the_first_one_built(
         assert_same(index_file.quads(sky, height_rad), built)
     newest = max(index_file.folder().glob("*.bin"), key=lambda path: path.stat().st_mtime_ns)
     assert_same(index_file.read(newest), built)
+
+
+def resident_bytes(path: Path) -> int:
+    """The memory that the kernel counts for the maps of a file in this process."""
+    lines = Path("/proc/self/smaps").read_text().splitlines()
+    starts = [n for n, line in enumerate(lines) if line.endswith(str(path))]
+    sizes = [next(line for line in lines[n:] if line.startswith("Rss:")) for n in starts]
+    return sum(1024 * int(line.split()[1]) for line in sizes)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the kernel's figures are Linux's")
+def test_released_pages_are_no_memory_and_are_read_again(folder: Path) -> None:
+    _, path = first_file(folder)
+    index = index_file.read(path)
+    dropped = index_file.read(path)
+    copies = [part.copy() for part in index]
+    assert resident_bytes(path) > 0.9 * path.stat().st_size
+    del dropped  # a map that is gone is not asked for
+    index_file.release()
+    assert resident_bytes(path) == 0
+    for part, copy in zip(index, copies, strict=True):
+        np.testing.assert_array_equal(part, copy)
 
 
 def first_file(folder: Path) -> tuple[SkyIndex, Path]:

@@ -53,7 +53,7 @@ def code_of(stars):
 def test_the_index_holds_every_quad_of_locally_bright_stars_by_its_code() -> None:
     height = np.radians(85.0)
     vectors, mag = random_sky(45, 3)
-    sky = sky_index.build_without_pairs(vectors, mag)
+    sky = sky_index.build(vectors, mag)
     index = quad_index.build(sky, height)
     apart = 2 * np.arcsin(squareform(pdist(vectors)) / 2)
     brighter = [np.count_nonzero(apart[n, :n] < height / 2) for n in range(len(vectors))]

@@ -31,7 +31,7 @@ TANGENT = np.array(
 )
 RAYS = np.column_stack([TANGENT, np.ones(len(TANGENT))])
 RAYS /= np.linalg.norm(RAYS, axis=1, keepdims=True)
-SKY = sky_index.build_without_pairs(TRUTH.inv().apply(RAYS), np.arange(1.0, 9.0))
+SKY = sky_index.build(TRUTH.inv().apply(RAYS), np.arange(1.0, 9.0))
 
 
 def seen(tangent: np.ndarray) -> star_evidence.Detections:
@@ -83,13 +83,13 @@ def test_missing_stars_cost_the_beta_function_of_the_counts(missing: int) -> Non
     tangent = TANGENT[[0, 1, 2, 6]]
     gone = np.arange(3, 6)[missing:]
     kept = np.setdiff1d(np.arange(len(TANGENT)), gone)
-    fewer = sky_index.build_without_pairs(SKY.vectors[kept], SKY.mag[kept])
+    fewer = sky_index.build(SKY.vectors[kept], SKY.mag[kept])
     gates = np.full(4, 0.01)
     here = star_evidence.evaluate(
         seen(tangent), fewer, TRUTH.as_matrix(), 1.0, gates, -np.inf
     )
     none = np.setdiff1d(np.arange(len(TANGENT)), [3, 4, 5])
-    bare = sky_index.build_without_pairs(SKY.vectors[none], SKY.mag[none])
+    bare = sky_index.build(SKY.vectors[none], SKY.mag[none])
     whole = star_evidence.evaluate(
         seen(tangent), bare, TRUTH.as_matrix(), 1.0, gates, -np.inf
     )
@@ -118,7 +118,7 @@ def test_stars_to_the_limiting_magnitude_are_missed(limit_mag: float, missing: i
 def test_stars_outside_of_the_field_are_not_missed() -> None:
     """The faintest match is fainter than all; the eighth star is out of the field, one more is behind the camera."""
     behind = np.vstack([-SKY.vectors[:1], SKY.vectors[:7]])
-    sky = sky_index.build_without_pairs(behind, np.arange(1.0, 9.0))
+    sky = sky_index.build(behind, np.arange(1.0, 9.0))
     hypothesis = star_evidence.evaluate(
         seen(TANGENT[:7]), sky, TRUTH.as_matrix(), 1.0, np.full(7, 0.01), -np.inf
     )
@@ -169,7 +169,7 @@ def test_the_magnitudes_density_is_the_smoothed_catalog_s() -> None:
     vectors = rng.normal(size=(2000, 3))
     mag = np.sort(6 + 2 * np.log10(rng.uniform(1e-3, 1, 2000)))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    sky = sky_index.build_without_pairs(vectors, mag)
+    sky = sky_index.build(vectors, mag)
     for value in (3.0, 4.0, 5.0, 5.5):
         wanted = np.mean(norm.pdf(value, mag, sky_index.MAG_SMOOTHING))
         # Of bins of MAG_STEP.
@@ -185,7 +185,7 @@ def test_a_magnitude_s_likelihoods_of_one_star_add_up_to_one(star: int) -> None:
     """The ratio is p(mag | star) / p(mag): times the density of the stars seen it is a density of magnitudes."""
     vectors = np.random.default_rng(1).normal(size=(60, 3))
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    sky = sky_index.build_without_pairs(vectors, np.linspace(2, 6, 60))
+    sky = sky_index.build(vectors, np.linspace(2, 6, 60))
     mag = np.arange(-2, 10, 1e-3)
     share = 0.8
     detections = seen(np.zeros((len(mag), 2)))._replace(mag=mag)

@@ -82,7 +82,7 @@ def test_a_sky_without_a_pattern_is_refused() -> None:
         ImageError,
         match=r"2 pairs of stars within 12\.00 deg are too few; allowed: 3 or more",
     ):
-        sky_index.build(in_a_row, MAG[:3], WIDE_RAD)
+        sky_index.add_pairs(sky_index.build(in_a_row, MAG[:3]), WIDE_RAD)
 
 
 @pytest.mark.parametrize(("share", "brighter"), [(0.5, False), (0.5, True), (0.7, False)])
@@ -254,7 +254,7 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
     """Stars listed twice in the catalog give two attitudes: significant, ambiguous, and refused."""
     rng = np.random.default_rng(7)
     sparse, sparse_mag = random_sky(300, 8)
-    once = sky_index.build(sparse, sparse_mag, WIDE_RAD)
+    once = sky_index.add_pairs(sky_index.build(sparse, sparse_mag), WIDE_RAD)
     loose = 5e-4
     dex = np.inf
     while not star_search.ACCEPT_DEX < dex < star_search.DECISIVE_DEX:
@@ -270,7 +270,7 @@ def test_a_sky_that_repeats_is_ambiguous() -> None:
     vectors = np.concatenate([sparse[clear], copied])
     both = np.concatenate([sparse_mag[clear], sparse_mag[row]])
     order = np.argsort(both, kind="stable")
-    twice = sky_index.build(vectors[order], both[order], WIDE_RAD)
+    twice = sky_index.add_pairs(sky_index.build(vectors[order], both[order]), WIDE_RAD)
     assert not len(solve(detections_of(tangent, mag, sigma=loose), twice).star)
 
 
@@ -411,7 +411,7 @@ def test_every_triangle_of_the_catalog_that_fits_is_closed(zoom: float) -> None:
     vectors, mag = random_sky(60, 6)
     vectors = vectors * [0.05, 0.05, 0] + [0, 0, 1]
     vectors /= np.linalg.norm(vectors, axis=1, keepdims=True)
-    sky = sky_index.build(vectors, mag, WIDE_RAD)
+    sky = sky_index.add_pairs(sky_index.build(vectors, mag), WIDE_RAD)
     sigma = 2e-4
     tangent = vectors[[7, 30, 41], :2] / vectors[[7, 30, 41], 2:] * (1 + zoom / 2)
     lights = detections_of(tangent, np.full(3, np.nan), sigma, zoom)
@@ -457,7 +457,7 @@ def test_a_pair_s_attitude_counts_as_laplace_s_integral(zoom: float) -> None:
     near = np.array([[0.01, 0.004], [-0.008, -0.002]])
     detections = detections_of(near, [np.nan, np.nan], zoom=zoom)
     rays = np.column_stack([near, np.ones(2)])
-    sky = sky_index.build_without_pairs(
+    sky = sky_index.build(
         rays / np.linalg.norm(rays, axis=1, keepdims=True), np.array([1.0, 2.0])
     )
     info = np.zeros((4, 4))

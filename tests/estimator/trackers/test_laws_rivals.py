@@ -81,7 +81,7 @@ def tracker(
     assert deep.searches[0].by_quads
     # Neither the frame nor its rivals are found by pairs.
     deep.searches = deep.searches[:1]
-    deep.sky = sky_index.build_without_pairs(deep.sky.vectors, deep.sky.mag)
+    deep.sky = sky_index.build(deep.sky.vectors, deep.sky.mag)
     return deep
 
 
@@ -143,3 +143,24 @@ def test_a_refusal_names_its_reason() -> None:
     for truth in Rotation.random(3, rng=7):
         zoomed = lights((truth, 0.0, 100), scale=1.2)
         assert TRACKER.solve_centroids(zoomed).status == WRONG_SCALE
+
+
+def test_a_deep_sky_gets_its_pairs_when_they_are_searched(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("ESTIMATOR_CACHE_DIR", str(tmp_path))
+    monkeypatch.setattr(index_file, "FEW_STARS", 0)
+    deep = StarTracker.for_sky(CAMERA)
+    frame = lights((Rotation.random(rng=5), 0.0, 30))
+    assert deep.solve_centroids(frame).solved
+    assert not len(deep.sky.pair)  # quads have found it
+    assert deep.field_matcher.patterns == len(TRACKER.sky.pair)
+    by_pairs = deep.solve_centroids(frame, effort=1)
+    expected = TRACKER.solve_centroids(frame, effort=0)
+    assert by_pairs.cam_from_ref is not None
+    assert expected.cam_from_ref is not None
+    np.testing.assert_array_equal(
+        by_pairs.cam_from_ref.as_quat(), expected.cam_from_ref.as_quat()
+    )
+    for name in ("pair", "first", "bin_rad"):
+        np.testing.assert_array_equal(getattr(deep.sky, name), getattr(TRACKER.sky, name))
