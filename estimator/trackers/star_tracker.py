@@ -235,7 +235,9 @@ class StarTracker(FrameTracker):
             limit_mag = checks.number(
                 "limit_mag", 6.0 if limit_mag is None else limit_mag, -30, 30, "-30 to 30"
             )
-        stars = catalog.hipparcos() if stars is None else catalog.checked(stars)
+        stars = (
+            catalog.hipparcos() if stars is None else catalog.checked(stars).brightest_first()
+        )
         if limit_mag is not None:
             stars = catalog.brighter_than(stars, limit_mag)
         vectors = catalog.apparent(stars, catalog.on_earth(catalog.utc(date)))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from estimator.catalog import catalog, index_file
+from estimator.catalog import catalog
 from estimator.core.camera import Camera
 from estimator.core.types import Centroids
 from estimator.trackers.pipeline import Clock, Settings, detect_and_centroid
@@ -343,30 +343,6 @@ def test_few_lights_are_not_tried_any_further(monkeypatch: pytest.MonkeyPatch) -
         == diagnosis.shallow_catalog(nothing)
         == ""
     )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("few", [2000, 10**6])
-def test_trackers_of_many_stars_are_not_kept_after_a_refusal(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, few: int
-) -> None:
-    """Those of a deep catalog would be hundreds of megabytes; those of few stars are kept for the next refusal."""
-    monkeypatch.setenv("ESTIMATOR_CACHE_DIR", str(tmp_path))
-    solver = plate_solver.make_solver(20.0, None, catalog="hipparcos_hp6.5")
-    rng = np.random.default_rng(8)
-    lights = Centroids(rng.uniform(0, 500, (20, 2)), np.full(20, 0.1), np.arange(20.0, 0, -1))
-    refusal = diagnosis.Refusal(photograph(), lights, (solver,))
-    size_px = refusal.size_px
-    own = next(solver.trackers(*size_px))
-    monkeypatch.setattr(index_file, "FEW_STARS", few)
-    assert diagnosis.other_field(refusal) == ""
-    (kept,) = solver.tracker_cache.values()
-    unknown = diagnosis.replace(solver, fov_deg=None)
-    counts = [len(one.stars) for one in unknown.trackers(*size_px, 0)]
-    assert len(kept) == 1 + sum(count <= few for count in counts)
-    assert len(counts) > 5
-    assert own in kept.values()
-    assert max(len(one.stars) for one in kept.values() if one is not own) <= few
 
 
 @pytest.mark.slow

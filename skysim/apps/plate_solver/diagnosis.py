@@ -23,7 +23,6 @@ import cv2
 import numpy as np
 
 from estimator.attitude.rate import covariance_of
-from estimator.catalog import index_file
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
 from estimator.core.types import Blobs, Centroids, FramePriors
@@ -177,8 +176,7 @@ def other_field(refusal: Refusal) -> str:
         return ""
     unknown = replace(refusal.solvers[0], fov_deg=None, camera=None)
     cameras = unknown.candidate_cameras(*refusal.size_px)
-    # A hundred megabytes of a deep catalog are not kept for a further refusal.
-    trackers = unknown.trackers(*refusal.size_px, index_file.FEW_STARS)
+    trackers = unknown.trackers(*refusal.size_px)
     attitude, _ = best_attitude(refusal.centroids, trackers, Clock(), 0, len(cameras))
     if not attitude.solved:
         return ""

@@ -201,22 +201,19 @@ class Solver:
         ]
         return min(ends), max(ends)
 
-    def trackers(
-        self, width_px: int, height_px: int, most_stars: float = math.inf
-    ) -> Iterator[StarTracker]:
+    def trackers(self, width_px: int, height_px: int) -> Iterator[StarTracker]:
         """Yield the trackers for an image of this size: one, or one per range of fields of view.
 
-        Trackers of up to `most_stars` stars are cached until an image of another size or date comes.
+        Trackers are built when first needed and cached until an image of another size or date comes.
         """
         key = width_px, height_px, self.time_utc
         if key not in self.tracker_cache:
             self.tracker_cache.clear()  # keep the trackers of one image size and date only
         cached = self.tracker_cache.setdefault(key, {})
         for camera in self.candidate_cameras(width_px, height_px):
-            tracker = cached.get(camera) or self.tracker(*camera)
-            if len(tracker.stars) <= most_stars:
-                cached[camera] = tracker
-            yield tracker
+            if camera not in cached:
+                cached[camera] = self.tracker(*camera)
+            yield cached[camera]
 
     def tracker(self, camera: Camera, uncertainty: float) -> StarTracker:
         """A tracker with the brightest stars of the catalog, as many as its narrowest field needs.

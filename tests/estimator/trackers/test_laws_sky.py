@@ -477,6 +477,10 @@ def test_a_tracker_for_the_sky_has_the_stars_to_its_limit_as_seen_at_the_date(
     chord = cKDTree(mean).query(tracker.stars.vectors[:20])[0]
     assert np.median(chord) < np.radians(20.6 / 3600)
     assert chord.max() > np.radians(1 / 3600)
+    # The order of a catalog is not relied on.
+    faintest_first = catalog.hipparcos().take(slice(None, None, -1))
+    other = StarTracker.for_sky(CAMERA, limit_mag, f"{year}-06-22", stars=faintest_first)
+    np.testing.assert_allclose(other.stars.v_mag, tracker.stars.v_mag, rtol=0, atol=1e-12)
 
 
 def test_chance_matches_are_counted_over_the_circles_of_the_predicted_stars() -> None:
