@@ -6,7 +6,6 @@ seconds of CPU, which other load lengthens less. docs/explanation/scale.md uses 
 
 from __future__ import annotations
 
-import tarfile
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -150,7 +149,6 @@ def parts_of(made: dataset_run.DatasetPlan) -> dict[str, float]:
     """Milliseconds of CPU of a frame: render; label (detection, masks); encode (COCO, numbers); write (the tar)."""
     spent = dict.fromkeys(("render", "label", "encode", "write"), 0.0)
     with tempfile.TemporaryFile() as file:
-        tar = tarfile.TarFile(fileobj=file, mode="w", format=tarfile.USTAR_FORMAT)
         by = None
         for number, levels, setup, one in dataset_run.labelled_frames(made, 0):
             by = by or labeller(setup.lab.scene)
@@ -165,7 +163,7 @@ def parts_of(made: dataset_run.DatasetPlan) -> dict[str, float]:
                 )
                 dataset_shards.coco_annotations(one, number)
             with timed(spent, "write"):
-                dataset_shards.add_frame(tar, number, one, row | {"levels": levels}, False)
+                dataset_shards.add_frame(file, number, one, row | {"levels": levels}, False)
     spent["label"] -= spent["render"]
     return {name: 1e3 * seconds / PARTS for name, seconds in spent.items()}
 

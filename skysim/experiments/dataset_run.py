@@ -71,7 +71,6 @@ AS_IT_IS: Record = {"variation": {"levels": {"none": {}}}}
 TRACKED = f"{TRIAL}tracked"
 DRAW = 2  # first of the four numbers of a draw's key; seeds of trials and of hardware have up to three
 FORMATS = ("webdataset", "zarr", "coco")
-WHOLE_BYTES = 1 << 30  # larger than a file of a tar, so that each is written at once
 
 
 @frozen
@@ -350,20 +349,13 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
     coco = []
     name = shard_name(SHARDS, shard, "tar")
     with storage.writer(name) if "webdataset" in plan.formats else nullcontext() as file:
-        tar = (
-            tarfile.TarFile(
-                fileobj=file, mode="w", format=tarfile.USTAR_FORMAT, copybufsize=WHOLE_BYTES
-            )
-            if file
-            else None
-        )
         for frame, levels, setup, one in labelled_frames(plan, shard):
             numbers = {"frame": frame, "shard": shard, "seed": plan.seed(frame)}
             row = frame_labels(one, setup.lab.scene, numbers)
-            row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if tar else ""}
+            row |= {"pixel_type": one.frame.image_dn.dtype.str, "file": name if file else ""}
             row["position"] = (
-                add_frame(tar, frame, one, row | {"levels": levels}, plan.compress)
-                if tar
+                add_frame(file, frame, one, row | {"levels": levels}, plan.compress)
+                if file
                 else -1
             )
             rows.append(row | {"levels": json.dumps(levels, default=str)})
@@ -372,8 +364,8 @@ def make_shard(plan: DatasetPlan, storage: Storage, shard: int) -> ShardResult:
                 images.append(one.frame.image_dn)
             if "coco" in plan.formats:
                 coco.append(coco_annotations(one, frame))
-        if tar:
-            tar.close()
+        if file:
+            tarfile.TarFile(fileobj=file, mode="w").close()  # writes the end of the tar
     if images:
         write_zarr(storage, frames.start, images, shard)
     if "coco" in plan.formats:

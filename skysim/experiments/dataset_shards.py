@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
+from numpy.lib import format as npy
 
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -162,9 +163,7 @@ def label_frame(
         radius_rad = math.radians(body.diameter_arcsec / 7200)
         own = sources["id"] == body.id
         sources["radius_px"][own] = radius_rad * scene.camera.focal_px
-    extents = image_extents(
-        sources, exposure_window(scene, frame.index), scene.camera.height_px
-    )
+    extents = image_extents(sources, exposure_window(scene, frame.index))
     least_dn = frame.saturation_dn
     if frame.image_dn.dtype.kind == "u":
         least_dn = math.ceil(least_dn)  # an integer compares faster
@@ -210,7 +209,7 @@ def brightest_near(found_px: Floats, source_px: Floats, reach_px: Floats) -> Int
     return chosen
 
 
-def image_extents(rows: Array, window: Window, height_px: int) -> Extents:
+def image_extents(rows: Array, window: Window) -> Extents:
     """The rectangle about each source's streak.
 
     On each side it is wider than the streak by REACH_SIGMA standard deviations of the blur, or by the radius of a disc
@@ -229,7 +228,7 @@ def image_extents(rows: Array, window: Window, height_px: int) -> Extents:
     rolling = rolling / np.maximum(1 - rolling * streak[:, 1], 0.1)
     radius = rows["radius_px"].astype(float)
     disc = radius > DISC_PX
-    delay = rolling * (rows["y_px"] - (height_px - 1) / 2)
+    delay = rolling * (rows["y_px"] - (window.rows - 1) / 2)
     middle = np.column_stack([rows["x_px"], rows["y_px"]]) + delay[:, None] * streak
     center = np.where(
         disc[:, None], middle, np.column_stack([rows["flux_x_px"], rows["flux_y_px"]])
@@ -382,30 +381,37 @@ def shard_name(folder: str, shard: int, suffix: str) -> str:
     return f"{folder}/{shard:06d}.{suffix}"
 
 
-def add_file(tar: tarfile.TarFile, name: str, data: bytes) -> int:
-    """Append a file without time and owner, so that the same frames give the same bytes; return where it ends."""
+def add_file(file: IO[bytes], name: str, *parts: bytes | memoryview) -> int:
+    """Append a file to a tar, without time and owner, so that the same frames give the same bytes.
+
+    Returns where it ends.
+    """
     header = tarfile.TarInfo(name)
-    header.size = len(data)
-    begin = tar.offset + tarfile.BLOCKSIZE
-    tar.addfile(header, io.BytesIO(data))
-    return begin + len(data)
+    header.size = sum(map(len, parts))
+    file.writelines([header.tobuf(tarfile.USTAR_FORMAT), *parts])
+    end = file.tell()
+    file.write(bytes(-header.size % tarfile.BLOCKSIZE))
+    return end
 
 
 def add_frame(
-    tar: tarfile.TarFile, number: int, one: LabelledFrame, labels: Record, compress: bool
+    file: IO[bytes], number: int, one: LabelledFrame, labels: Record, compress: bool
 ) -> int:
     """Append a frame with its labels; return the position of its first pixel, -1 if it is compressed (an .npz)."""
     key = key_of(number)
     image = np.ascontiguousarray(one.frame.image_dn)
+    pixels = image.data.cast("B")
     data = io.BytesIO()
     if compress:
         np.savez_compressed(data, image=image)
+        pixels = pixels[:0]
     else:
-        np.save(data, image)
-    end = add_file(tar, f"{key}.{IMAGE_NAME[compress]}", data.getvalue())
+        # As `np.save`, which would copy the pixels twice.
+        npy.write_array_header_1_0(data, npy.header_data_from_array_1_0(image))
+    end = add_file(file, f"{key}.{IMAGE_NAME[compress]}", data.getvalue(), pixels)
     sources = io.BytesIO()
     np.save(sources, one.sources)
-    add_file(tar, f"{key}.sources.npy", sources.getvalue())
+    add_file(file, f"{key}.sources.npy", sources.getvalue())
     masks = {
         name: {"size": list(image.shape), "counts": counts}
         for name, counts in one.masks.items()
@@ -415,7 +421,7 @@ def add_frame(
         "unmatched_px": one.unmatched_px.tolist(),
         "hidden": one.truth.hidden.tolist(),
     }
-    add_file(tar, f"{key}.frame.json", json.dumps(labels | more).encode())
+    add_file(file, f"{key}.frame.json", json.dumps(labels | more).encode())
     return -1 if compress else end - image.nbytes
 
 

@@ -120,7 +120,7 @@ def test_the_box_of_a_still_star_is_a_square_about_it() -> None:
     rows["streak_x_px"] = [0, 1e-14, -1e-14]
     rows["sigma_px"] = 0.7
     for box, outline in zip(
-        *dataset_shards.outlines(dataset_shards.image_extents(rows, Window(0, 1), 100)),
+        *dataset_shards.outlines(dataset_shards.image_extents(rows, Window(0, 1))),
         strict=True,
     ):
         assert box == pytest.approx([10.5 - 2.1, 20.5 - 2.1, 4.2, 4.2])

@@ -98,6 +98,28 @@ def test_every_format_has_the_same_frames(whole: Path) -> None:
     )
 
 
+def test_a_shard_has_the_bytes_that_tarfile_and_numpy_would_write(whole: Path) -> None:
+    """Both read each file of the shard and write it again."""
+    for path in sorted((whole / "shards").glob("*.tar")):
+        again = io.BytesIO()
+        with (
+            tarfile.open(path) as tar,
+            tarfile.TarFile(fileobj=again, mode="w", format=tarfile.USTAR_FORMAT) as copy,
+        ):
+            for member in tar:
+                file = tar.extractfile(member)
+                assert file is not None
+                data = file.read()
+                if member.name.endswith(".npy"):
+                    written = io.BytesIO()
+                    np.save(written, np.load(io.BytesIO(data)))
+                    assert written.getvalue() == data
+                header = tarfile.TarInfo(member.name)
+                header.size = len(data)
+                copy.addfile(header, io.BytesIO(data))
+        assert again.getvalue() == path.read_bytes()
+
+
 def test_the_table_of_sources_has_the_sources_of_the_frames(whole: Path) -> None:
     made = samples(whole)
     found = [

@@ -237,7 +237,7 @@ def test_each_row_has_the_attitude_of_its_trial() -> None:
     """The quaternion is that of the draw; under the dome tilt and azimuth are those of the body's axis."""
     for spec in (SKY, DOME):
         setup = trials.prepared_setup(spec, {})
-        drawn = trials.random_attitude(setup, trials.streams(setup, 8)[0])
+        drawn = trials.random_attitudes(setup, [trials.streams(setup, 8)[0]])[0]
         (outcome,) = trials.run_centroid_trials(setup, [8])
         wxyz = [getattr(outcome, f"lab_from_body_{axis}") for axis in "wxyz"]
         assert (Rotation.from_quat(wxyz, scalar_first=True) * drawn.inv()).magnitude() < 1e-12

@@ -66,7 +66,9 @@ def test_attitudes_are_uniform_over_the_allowed_range(spec, key):
     low, high = (-60.0, 30.0) if spec is SKY else (10.0, 30.0)
     ready = trials.prepared_setup(spec, {key: [low, high]})
     rng = np.random.default_rng(3)
-    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
+    drawn = Rotation.concatenate(
+        [trials.random_attitudes(ready, [rng])[0] for _ in range(2000)]
+    )
     if spec is SKY:
         boresight = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1]))
         ends = np.sin(np.radians([low, high]))
@@ -90,7 +92,9 @@ def test_attitudes_near_the_zenith_are_at_their_altitudes():
         SKY, {"start_time": "2012-10-29T22:00:00", "site": site, "trial.near": near}
     )
     rng = np.random.default_rng(4)
-    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(200)])
+    drawn = Rotation.concatenate(
+        [trials.random_attitudes(ready, [rng])[0] for _ in range(200)]
+    )
     x, y, z = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1])).T
     place = EarthLocation.from_geodetic(8.8, 53.1)
     with iers.conf.set_temp("auto_download", False):
@@ -111,7 +115,9 @@ def test_attitudes_near_a_body_are_uniform_about_it():
         SKY, {"start_time": "2012-07-03T18:00:00", "trial.near": near}
     )
     rng = np.random.default_rng(3)
-    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
+    drawn = Rotation.concatenate(
+        [trials.random_attitudes(ready, [rng])[0] for _ in range(2000)]
+    )
     boresight = drawn.apply(ready.lab.camera.mount.cam_from_body.inv().apply([0, 0, 1]))
     moon = place(
         "moon", observe_from(ready.lab.scene.start_time, ready.lab.scene.site)
@@ -130,7 +136,9 @@ def test_the_roll_about_the_boresight_is_uniform():
     """The body's x axis against the meridian through the boresight; under the dome against its own lean."""
     ready = trials.prepared_setup(DOME, {"trial.tilt_deg": 20})
     rng = np.random.default_rng(4)
-    drawn = Rotation.concatenate([trials.random_attitude(ready, rng) for _ in range(2000)])
+    drawn = Rotation.concatenate(
+        [trials.random_attitudes(ready, [rng])[0] for _ in range(2000)]
+    )
     seen = drawn.inv().apply([0, 0, 1])
     assert np.degrees(np.arccos(seen[:, 2])) == pytest.approx(20, abs=1e-9)
     assert (
@@ -153,7 +161,7 @@ def test_lights_of_a_trial_match_the_renderer_s_positions_and_brightness(spec):
     """Pixel and electrons against the truth of a rendered frame, of those lights whose whole image is on the chip."""
     ready = trials.prepared_setup(spec, {"background": []})
     lab = ready.lab
-    lab_from_body = trials.random_attitude(ready, np.random.default_rng(5))
+    lab_from_body = trials.random_attitudes(ready, [np.random.default_rng(5)])[0]
     _, truth = render_at_rest(lab.camera, lab_from_body)
     (view,) = detections.visible_rows(lab, Rotation.concatenate([lab_from_body]))
     xy_px = view.xy_px
@@ -434,7 +442,7 @@ def test_a_flight_starts_anywhere_and_the_same_for_the_same_seed(name):
     starts = [trials.trial_flight(ready, seed).state.lab_from_body for seed in (5, 6, 5)]
     assert (starts[0].inv() * starts[2]).magnitude() == 0
     assert (starts[0].inv() * starts[1]).magnitude() > 0.01
-    drawn = trials.random_attitude(other, trials.streams(other, 5)[0])
+    drawn = trials.random_attitudes(other, [trials.streams(other, 5)[0]])[0]
     assert (starts[0].inv() * drawn).magnitude() == 0
     scene_start = ready._replace(trial=plan.FlightTrial(kind="flight"))
     fixed = trials.trial_flight(scene_start, 5).state.lab_from_body

@@ -380,7 +380,7 @@ def trial_flight(setup: TrialSetup, seed: int) -> Flight:
     lab = setup.lab.in_run(seed)
     assert isinstance(trial, FlightTrial)
     if trial.start is not None:
-        lab = replace(lab, start=random_attitude(setup, random_stream(seed, 0)))
+        lab = replace(lab, start=random_attitudes(setup, [random_stream(seed, 0)])[0])
     return Flight(lab, UserParts(setup.programs, tracker=setup.estimator))
 
 
@@ -410,11 +410,6 @@ TRIALS: dict[str, Trials] = {
 
 
 # Parts of trials.
-
-
-def random_attitude(setup: TrialSetup, rng: Generator) -> Rotation:
-    """Random lab_from_body, see `random_attitudes`."""
-    return random_attitudes(setup, [rng])[0]
 
 
 def random_attitudes(setup: TrialSetup, rngs: Sequence[Generator]) -> Rotation:
@@ -537,7 +532,7 @@ def moving_camera(setup: TrialSetup, seed: int) -> MovingCamera:
 def attitude_and_axis(setup: TrialSetup, rng: Generator) -> tuple[Rotation, Floats]:
     """Random lab_from_body of a frame trial, and the (3,) axis of its rate in camera axes."""
     assert isinstance(setup.trial, FrameTrial)
-    lab_from_body = random_attitude(setup, rng)
+    lab_from_body = random_attitudes(setup, [rng])[0]
     return lab_from_body, rate_axis(
         setup.trial.rate_axis, rng.uniform(0, 2 * math.pi), setup.lab.camera.mount
     )
