@@ -334,8 +334,7 @@ class StarTracker(FrameTracker):
                 f"0 to {self.efforts - 1}, or None",
                 True,
             )
-        clock = clock or Clock()
-        once = functools.partial(self._solve_global, clock=clock, effort=effort)
+        once = functools.partial(self._solve_global, clock=clock or Clock(), effort=effort)
         return solve_lights(self.camera, self.lights, centroids, once, rate, exposure_s)
 
     def with_errors(self, centroids: Centroids, _: object = None) -> Centroids:
@@ -600,14 +599,13 @@ class StarTracker(FrameTracker):
     ) -> tuple[Solution, float]:
         """Return the solution of one search, and the factor of the variances if it is known, else 0."""
         effort = self.settings.searched_stars, model.max_checks
-        calibrated = not (model.by_quads or self.focal_uncertainty)
         found = None
-        if calibrated and not self.camera.row_time_s:
+        if not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s):
             lights = flat_centroids(centroids, sigma_px)
             found = misfit.identify(lights, self._known, *effort)
         if found:
             solution, variance = found
-            exact = model.min_error_px == MIN_ERROR_PX or bool(model.relative_error)
+            exact = model.min_error_px == MIN_ERROR_PX or model.relative_error
             if exact or not len(solution.star):
                 return solution, variance
             # The larger errors have found the attitude; the residuals tell the errors.
