@@ -85,34 +85,19 @@ class Sensor(NamedTuple):
     aspect: float = 1.0
 
 
-class FlatCentroids(NamedTuple):
-    """Centroids as compiled code takes them.
-
-    Attributes
-    ----------
-    xy_px
-        (N, 2) positions, pixels
-    own_px, sigma_px
-        (N,) standard deviations of a position: of its own noise, and in total
-    flux
-        (N,) flux of each light
-    spread_px2
-        (N, 2, 2) covariance of the noise; (0, 2, 2) if it is the same in all directions
-    """
-
-    xy_px: Floats
-    own_px: Floats
-    flux: Floats
-    spread_px2: Floats
-    sigma_px: Floats
+# Centroids as compiled code takes them: a plain tuple, as numba takes twice as long to read a named one.
+#
+# - (N, 2) positions, pixels
+# - (N,) standard deviations of a position by its own noise, and in total
+# - (N,) flux of each light
+# - (N, 2, 2) covariance of the noise; (0, 2, 2) if it is the same in all directions
+FlatCentroids = tuple[Floats, ...]
 
 
 def flat_centroids(centroids: Centroids, sigma_px: Floats) -> FlatCentroids:
     """Centroids in the form for compiled code, with their total errors (N,)."""
     spread_px2 = NO_SPREAD if centroids.covariance_px2 is None else centroids.covariance_px2
-    return FlatCentroids(
-        centroids.xy_px, centroids.sigma_px, centroids.flux, spread_px2, sigma_px
-    )
+    return centroids.xy_px, centroids.sigma_px, sigma_px, centroids.flux, spread_px2
 
 
 class ChosenLights(NamedTuple):
@@ -123,13 +108,13 @@ class ChosenLights(NamedTuple):
     centroids
         Their centroids
     rows
-        (N,) rows of the frame's centroids: of each light's brightest image
+        (N,) rows of the frame's centroids: of each light's brightest image; None if all are lights as they are
     offset_px
         (2,) standard deviation along x and y of the common error of double images
     """
 
     centroids: Centroids
-    rows: NDArray[np.int64]
+    rows: NDArray[np.int64] | None
     offset_px: Floats
 
 
@@ -145,15 +130,15 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
        eigenvalues, and their difference is the variance of an error that is common to all lights.
     """
     # 1. Number
-    rows = np.arange(len(centroids))
-    if len(rows) > most:
+    rows = None
+    if len(centroids) > most:
         field = np.array([0.0, width_px, 0.0, height_px])
         rows = spread(centroids.xy_px, field, most)
         centroids = centroids.take(rows)
     # 2. Double images
-    head, are_pairs = brighter_within(centroids.xy_px, DOUBLE_PX)
-    by_chance = len(head) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
-    if not are_pairs or by_chance > 1 / 8:
+    head = brighter_within(centroids.xy_px, DOUBLE_PX)
+    by_chance = len(centroids) * np.pi * DOUBLE_PX**2 / 2 / (width_px * height_px)
+    if head is None or by_chance > 1 / 8:
         return ChosenLights(centroids, rows, np.zeros(2))
     first, group, members = np.unique(head, return_inverse=True, return_counts=True)
     sums_px = [np.bincount(group, x) for x in centroids.xy_px.T]
@@ -180,12 +165,12 @@ def lights_of(centroids: Centroids, width_px: int, height_px: int, most: int) ->
     moments = np.median(second_px[:, :, None] * second_px[:, None, :], axis=0)
     variance, axes = np.linalg.eigh(moments)
     common_px = np.sqrt(variance[1] - variance[0]) * axes[:, 1]
-    return ChosenLights(merged, rows[first], common_px)
+    return ChosenLights(merged, first if rows is None else rows[first], common_px)
 
 
 @jit
-def brighter_within(xy_px: Floats, reach_px: float) -> tuple[Ints, bool]:
-    """Groups of near lights: (N,) row of the brightest of each light's group; whether at least half of them are pairs.
+def brighter_within(xy_px: Floats, reach_px: float) -> Ints | None:
+    """Groups of near lights: (N,) row of the brightest of each light's group; None unless at least half are pairs.
 
     The brightest is the first light within reach that is not itself near a brighter one, or else the light itself.
     """
@@ -199,7 +184,7 @@ def brighter_within(xy_px: Floats, reach_px: float) -> tuple[Ints, bool]:
                 head[n] = m
                 break
         members[head[n]] += 1
-    return head, 2 * np.sum(members == 2) >= np.sum(members > 0)
+    return head if 2 * np.sum(members == 2) >= np.sum(members > 0) else None
 
 
 @jit
@@ -211,28 +196,29 @@ def detections_of(
     The covariance of a position is that of its noise plus an isotropic excess, sigma_px^2 - own_px^2. Divided by the
     squared focal length it is the covariance of the tangents, to first order.
     """
-    count = len(lights.flux)
+    xy_px, own_px, sigma_px, flux, spread_px2 = lights
+    count = len(flux)
     focal_px = sensor.focal_px
     (center_x, center_y) = sensor.center_px
     sigma = np.empty(count)
     weight = np.empty((count, 3))
     mag = np.empty(count)
     for n in range(count):
-        xx = yy = lights.sigma_px[n] ** 2
+        xx = yy = sigma_px[n] ** 2
         xy = 0.0
-        if len(lights.spread_px2):
-            excess = xx - lights.own_px[n] ** 2
-            xx = lights.spread_px2[n, 0, 0] + excess
-            yy = lights.spread_px2[n, 1, 1] + excess
-            xy = lights.spread_px2[n, 0, 1]
+        if len(spread_px2):
+            excess = xx - own_px[n] ** 2
+            xx = spread_px2[n, 0, 0] + excess
+            yy = spread_px2[n, 1, 1] + excess
+            xy = spread_px2[n, 0, 1]
         # The variance along the major axis is the greater eigenvalue, (xx + yy) / 2 + hypot((xx - yy) / 2, xy).
         sigma[n] = sqrt((xx + yy) / 2 + hypot((xx - yy) / 2, xy)) / focal_px
         # The inverse of [xx xy; xy yy] is [yy -xy; -xy xx] / (xx yy - xy^2).
         scale = focal_px**2 / (xx * yy - xy * xy)
         weight[n] = yy * scale, xx * scale, -xy * scale
-        mag[n] = sensor.zero_point_mag - 2.5 * log10(lights.flux[n])
+        mag[n] = sensor.zero_point_mag - 2.5 * log10(flux[n])
     tangent = undistorted(
-        lights.xy_px, focal_px, center_x, center_y, sensor.distortion, sensor.aspect
+        xy_px, focal_px, center_x, center_y, sensor.distortion, sensor.aspect
     )
     # Detections are sorted by brightness: the middle one is the median.
     limit_mag = mag[count // 2] if count else np.nan
@@ -297,7 +283,9 @@ def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
 
 @jit
 def chosen(detections: Detections, rows: NDArray) -> Detections:
-    """The detections of some rows. A part of the detections has no limiting magnitude."""
+    """The detections of increasing rows. A part of the detections has no limiting magnitude."""
+    if len(rows) == len(detections.sigma):
+        return detections
     return Detections(
         detections.tangent[rows],
         detections.sigma[rows],
@@ -306,7 +294,7 @@ def chosen(detections: Detections, rows: NDArray) -> Detections:
         detections.mag_sigma,
         detections.field,
         detections.focal_uncertainty,
-        detections.limit_mag if len(rows) == len(detections.sigma) else np.nan,
+        np.nan,
     )
 
 

@@ -167,8 +167,11 @@ def evaluate(
             if dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
         # A fit that has converged on the same matches need not be repeated.
-        same = np.array_equal(observed, before[0]) and np.array_equal(star, before[1])
-        if same and fall < least_squares.CONVERGED_CHI2:
+        if (
+            fall < least_squares.CONVERGED_CHI2
+            and np.array_equal(observed, before[0])
+            and np.array_equal(star, before[1])
+        ):
             break
         # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
         if n < 2:
@@ -261,8 +264,7 @@ def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis
     _, fall = _fit(
         detections, sky, R, hypothesis.focal_ratio, hypothesis.observed, hypothesis.star, info
     )
-    # `info` becomes its Cholesky factor.
-    cholesky_solve(info, np.zeros(4))
+    factorize(info)
     width_dex = log10(sqrt(2 * pi) / info[3, 3] / (2 * detections.focal_uncertainty))
     return fall / 2 / log(10.0) + width_dex
 
@@ -342,7 +344,9 @@ def _fit(
                 info[i, j] += weighted_x * d_x[j] + weighted_y * d_y[j]
     # Solve for the step, and complete the symmetric matrix.
     factor = info[:count, :count].copy()
-    step = cholesky_solve(factor, gradient[:count])
+    factorize(factor)
+    step = gradient[:count].copy()
+    least_squares.cholesky_solve(factor, step)
     for i in range(4):
         for j in range(i):
             info[j, i] = info[i, j]
@@ -376,20 +380,17 @@ def slopes(x: float, y: float, f: float, d_x: Floats, d_y: Floats) -> None:
 
 
 @jit
-def cholesky_solve(a: Floats, b: Floats) -> Floats:
-    """Solve a x = b by Cholesky factorization; the lower triangle of `a` is replaced by its factor.
+def factorize(a: Floats) -> None:
+    """Replace the lower triangle of a matrix by its Cholesky factor.
 
-    Pivots are floored, so that a nearly singular matrix gives large but finite values.
+    Pivots are floored, so that a nearly singular matrix gives large but finite solutions.
     """
-    x = b.copy()
-    for i in range(len(b)):
+    for i in range(len(a)):
         for j in range(i + 1):
             # a_ij - sum over k < j of L_ik L_jk, then the pivot or the quotient.
             for k in range(j):
                 a[i, j] -= a[i, k] * a[j, k]
             a[i, j] = sqrt(max(a[i, i], 1e-300)) if i == j else a[i, j] / a[j, j]
-    least_squares.cholesky_solve(a, x)
-    return x
 
 
 @jit
@@ -466,7 +467,7 @@ def _evidence(
     # Attitude and focal length: (2 pi)^(n/2) / sqrt(det info) over the prior volume.
     count = 4 if detections.focal_uncertainty > 0 else 3
     factor = info[:count, :count].copy()
-    cholesky_solve(factor, np.zeros(count))
+    factorize(factor)
     total = 0.5 * count * log10(2 * pi) - prior_volume_dex(detections)
     for i in range(count):  # the product of the Cholesky factor's diagonal is sqrt(det info)
         total -= log10(factor[i, i])
@@ -556,16 +557,15 @@ def build_solution(
     The covariance is the attitude's block of info^-1: if the focal length is uncertain, it is marginalized over the
     focal ratio.
     """
-    covariance = np.zeros((3, 3))
     total = 0.0
     chi2 = 0.0
     count = 4 if detections.focal_uncertainty > 0 else 3
     # Column by column of the inverse of the Fisher information.
+    factor = hypothesis.info[:count, :count].copy()
+    factorize(factor)
+    inverse = np.eye(count)
     for axis in range(3):
-        unit = np.zeros(count)
-        unit[axis] = 1.0
-        column = cholesky_solve(hypothesis.info[:count, :count].copy(), unit)
-        covariance[axis] = column[:3]
+        least_squares.cholesky_solve(factor, inverse[axis])
     # Residuals: weighted by the inverse covariances for chi-square, and plain for the rms.
     for k in range(len(hypothesis.star)):
         observed = hypothesis.observed[k]
@@ -592,7 +592,7 @@ def build_solution(
         hypothesis.observed,
         hypothesis.star,
         xyzw,
-        covariance,
+        inverse[:3, :3].copy(),
         hypothesis.focal_ratio,
         rms,
         chi2,

@@ -179,9 +179,10 @@ def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
 
     The trace of R1^T R2 is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
     """
+    if second.dex == -np.inf:
+        return False
     # trace(R1^T R2) = sum of the products of the elements.
-    trace = np.sum(first.R_cam_from_ref * second.R_cam_from_ref)
-    return bool(second.dex > -np.inf and trace > 2.99)
+    return bool(np.sum(first.R_cam_from_ref * second.R_cam_from_ref) > 2.99)
 
 
 @jit

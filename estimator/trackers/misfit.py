@@ -8,7 +8,7 @@ each, and keeps the factor of most evidence. `lens_fit` then fits the camera, wh
 """
 
 from math import atan2, cos, log, log10, pi, sin, sqrt
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ DOUBTFUL = 0.7  # reduced chi-square above which larger errors are tried, also w
 TRIED = 2.0 ** np.arange(11)  # factors of the variances that are tried
 # log10 of the prior odds of each larger factor against the claimed errors.
 PRIOR_WRONG_DEX = log10((1 - PRIOR_RIGHT) / PRIOR_RIGHT / (len(TRIED) - 1))
+# A `Sensor` and a `SkyIndex` as plain tuples: numba takes three times as long to read named ones
+Known = tuple[tuple[Any, ...], ...]
 LENS_MATCHES = 6  # least number of matches for a fit of the lens
 
 
@@ -168,19 +170,20 @@ def with_errors(solution: Solution, factor: float, chi2: float, dex: float) -> S
 
 @jit
 def identify(
-    lights: FlatCentroids,
-    sensor: Sensor,
-    stars: SkyIndex,
-    max_detections: int,
-    max_checks: int,
-) -> tuple[Solution, float]:
+    lights: FlatCentroids, known: Known, max_detections: int, max_checks: int
+) -> tuple[Solution, float] | None:
     """Search centroids of a calibrated camera, and match the field again where the residuals are doubtful.
 
     Returns the solution of `star_search.lost_in_space` and the factor of the variances: that of `widened`, or 1 without
     doubt. The factor is 0 where the residuals are so large that the calibration may be wrong: the solution is then as
-    it was found.
+    it was found. Returns None, without a search, where companions are detectable: `with_companions` is then to look for
+    them before the doubt.
     """
-    detections = detections_of(lights, sensor, 0.0)
+    sensor, sky = known
+    detections = detections_of(lights, Sensor(*sensor), 0.0)
+    if not are_small(detections.sigma):
+        return None
+    stars = SkyIndex(*sky)
     solution = star_search.lost_in_space(detections, stars, max_detections, max_checks)
     if residuals_too_great(solution) or solution.focal_ratio != 1:
         return solution, 0.0

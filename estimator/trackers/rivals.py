@@ -105,7 +105,7 @@ def with_rivals(
     skies = [(match, attitude)]
     lights = flat_centroids(centroids, errors_px(centroids))
     # The matches give the zero point.
-    zero_mag = sky.mag[match.star] + 2.5 * np.log10(lights.flux[matched])
+    zero_mag = sky.mag[match.star] + 2.5 * np.log10(centroids.flux[matched])
     # A lens that is fitted to a distorted reflection does not fit the stars.
     cameras = (camera,) if camera == matcher.camera else (camera, matcher.camera)
     while len(skies) <= MOST_RIVALS and len(centroids) - len(matched) >= MIN_MATCHES:

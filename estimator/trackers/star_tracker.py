@@ -143,6 +143,9 @@ class StarTracker(FrameTracker):
         self.stars = catalog.merge_doubles(
             replace(stars, vectors=vectors), settings.merge_px / camera.focal_px
         )
+        self.lights = Lights(self.stars.vectors, np.zeros(3), self.with_errors)
+        mean_stars = len(self.stars) * camera.field_sr / (4 * np.pi)
+        self.most_lights = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * mean_stars))
         paired = int(min(settings.field_stars * 4 * np.pi / camera.field_sr, len(self.stars)))
         # Of so many stars not all pairs are indexed, and a separation has hundreds of candidates.
         self.deep = paired >= index_file.FEW_STARS
@@ -185,6 +188,10 @@ class StarTracker(FrameTracker):
             self.settings.magnitude_sigma,
             self.camera.aspect,
         )
+
+    @functools.cached_property
+    def _known(self) -> misfit.Known:
+        return tuple(self.sensor), tuple(self._paired_sky())
 
     @functools.cached_property
     def quads(self) -> quad_index.QuadIndex:
@@ -331,14 +338,10 @@ class StarTracker(FrameTracker):
                 f"0 to {self.efforts - 1}, or None",
                 True,
             )
-        clock = clock or Clock()
-        lights = Lights(
-            self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
-        )
-        once = functools.partial(self._solve_global, clock=clock, effort=effort)
-        return solve_lights(self.camera, lights, centroids, once, rate, exposure_s)
+        once = functools.partial(self._solve_global, clock=clock or Clock(), effort=effort)
+        return solve_lights(self.camera, self.lights, centroids, once, rate, exposure_s)
 
-    def with_errors(self, centroids: Centroids) -> Centroids:
+    def with_errors(self, centroids: Centroids, _: object = None) -> Centroids:
         """Return the centroids with their total errors as covariances."""
         sigma_px = self.sigma_px(centroids)
         excess_px2 = (sigma_px**2 - centroids.sigma_px**2)[:, None, None] * np.eye(2)
@@ -528,9 +531,7 @@ class StarTracker(FrameTracker):
         A refusal of all searches says whether another scale would be solved.
         """
         camera = self.camera
-        stars = len(self.stars) * self.camera.field_sr / (4 * np.pi)
-        most = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * stars))
-        lights = lights_of(centroids, camera.width_px, camera.height_px, most)
+        lights = lights_of(centroids, camera.width_px, camera.height_px, self.most_lights)
         attitude = self._identify_by_evidence(lights.centroids, clock, effort)
         if effort is None and attitude.status in (BUDGET, FALSE_LIGHTS):
             # A short search whose focal length is hardly known may find a decisive one out of range.
@@ -540,7 +541,8 @@ class StarTracker(FrameTracker):
             if is_decisive and abs(found.focal_ratio - 1) > self.focal_uncertainty:
                 return Attitude(WRONG_SCALE)
         attitude = self._with_rivals(attitude, lights.centroids, clock)
-        if len(lights.rows) == len(centroids):
+        rows = lights.rows
+        if rows is None:
             return attitude
         # The common error turns the camera about the axes across it.
         x, y = lights.offset_px / camera.focal_px
@@ -551,7 +553,7 @@ class StarTracker(FrameTracker):
                 return found
             return replace(
                 found,
-                match=replace(found.match, observed=lights.rows[found.match.observed]),
+                match=replace(found.match, observed=rows[found.match.observed]),
                 covariance_rad2=found.covariance_rad2 + np.outer(turn_rad, turn_rad),
             )
 
@@ -601,26 +603,22 @@ class StarTracker(FrameTracker):
     ) -> tuple[Solution, float]:
         """Return the solution of one search, and the factor of the variances if it is known, else 0."""
         effort = self.settings.searched_stars, model.max_checks
-        calibrated = not (model.by_quads or self.focal_uncertainty)
-        if (
-            calibrated
-            and not self.camera.row_time_s
-            and misfit.are_small(sigma_px / self.camera.focal_px)
-        ):
+        found = None
+        if not (model.by_quads or self.focal_uncertainty or self.camera.row_time_s):
             lights = flat_centroids(centroids, sigma_px)
-            solution, variance = misfit.identify(
-                lights, self.sensor, self._paired_sky(), *effort
-            )
-            exact = model.min_error_px == MIN_ERROR_PX or bool(model.relative_error)
+            found = misfit.identify(lights, self._known, *effort)
+        if found:
+            solution, variance = found
+            exact = model.min_error_px == MIN_ERROR_PX or model.relative_error
             if exact or not len(solution.star):
                 return solution, variance
             # The larger errors have found the attitude; the residuals tell the errors.
             claimed = self.detections(centroids, self.sigma_px(centroids))
             R_cam_from_ref = matrix_of(solution.cam_from_ref_xyzw)
-            found = star_evidence.evaluate(
+            again = star_evidence.evaluate(
                 claimed, self.sky, R_cam_from_ref.copy(), 1.0, gates_of(claimed, 1.5), -np.inf
             )
-            solution = star_evidence.build_solution(claimed, self.sky, found)
+            solution = star_evidence.build_solution(claimed, self.sky, again)
             return misfit.widened(solution, R_cam_from_ref, claimed, self.sky)
         detections = self.detections(centroids, sigma_px, model.focal_uncertainty)
         if not model.by_quads:

@@ -32,7 +32,7 @@ from estimator.core.types import (
 from estimator.detection import background, bayer, classify, components, detect, windows
 from estimator.detection.classify import Flag
 from estimator.detection.detect import DETECTORS
-from estimator.identification.star_detections import FlatCentroids, Sensor, detections_of
+from estimator.identification.star_detections import Sensor, detections_of
 from estimator.trackers import pipeline
 from estimator.trackers.pipeline import Clock, Settings
 from tests.helpers.laws import (
@@ -438,9 +438,7 @@ def test_weights_are_the_inverse_of_all_the_errors(
     spread = roots @ roots.transpose(0, 2, 1) + 0.01 * np.eye(2)
     sigma = np.sqrt(np.trace(spread, axis1=1, axis2=2) / 2)
     known = NO_SPREAD if even else spread
-    lights = FlatCentroids(
-        np.zeros((count, 2)), sigma, np.ones(count), known, np.hypot(sigma, more_px)
-    )
+    lights = (np.zeros((count, 2)), sigma, np.hypot(sigma, more_px), np.ones(count), known)
     seen = detections_of(
         lights, Sensor(1.0, (0.0, 0.0), (0.0,) * 5, np.zeros(4), np.nan, 0.25), 0.0
     )

@@ -45,4 +45,6 @@ def test_pairs_of_some_stars_and_of_chance_stay_apart() -> None:
     ):
         count = len(xy_px)
         seen = Centroids(xy_px, np.full(count, 0.1), np.linspace(count, 1, count))
-        assert lights_of(seen, size, size, count).centroids is seen
+        whole = lights_of(seen, size, size, count)
+        assert whole.centroids is seen
+        assert whole.rows is None

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as some
+from numba import types
 from scipy import linalg, stats
 from scipy.spatial.transform import Rotation
 
@@ -19,7 +20,7 @@ from estimator.core.camera import Camera
 from estimator.core.checks import Floats
 from estimator.core.types import Centroids
 from estimator.identification import star_evidence, star_search
-from estimator.identification.star_detections import changed, gates_of
+from estimator.identification.star_detections import changed, flat_centroids, gates_of
 from estimator.trackers import misfit
 from estimator.trackers.pipeline import Settings
 from estimator.trackers.star_tracker import StarTracker
@@ -286,6 +287,23 @@ def test_unmatched_detections_near_a_star_are_counted_within_their_gates(
             )
             == 1
         )
+
+
+def test_a_search_takes_plain_tuples_and_no_centroids_that_show_companions(
+    tracker: StarTracker,
+) -> None:
+    """numba takes three times as long to read a named tuple as a plain one, in each call."""
+    _, centroids = field(tracker, 5, CAMERA)
+    assert tracker.solve_centroids(centroids).solved
+    for lights, (sensor, sky), *_ in misfit.identify.signatures:
+        for read in (lights, sensor, sky):
+            assert not isinstance(read, types.NamedTuple | types.NamedUniTuple)
+    angle_rad = misfit.ERROR_RAD[-1]
+    for factor, searched in ((0.99, False), (1.01, True)):
+        sigma_px = np.full(len(centroids), factor * angle_rad * CAMERA.focal_px)
+        lights = flat_centroids(centroids, sigma_px)
+        found = misfit.identify(lights, tracker._known, 80, 600)
+        assert (found is not None) is searched
 
 
 def test_the_widest_gates_are_those_of_the_largest_errors_that_are_tried(

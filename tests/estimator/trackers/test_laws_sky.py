@@ -319,9 +319,9 @@ def test_an_attitude_is_correct_or_none(
     assert not named.solved or (named.cam_from_ref * truth.inv()).magnitude() < 0.02
     xy = np.concatenate([centroids.xy_px, rng.uniform(0, [639, 479], (false, 2))])
     mixed = Centroids(xy, np.full(len(xy), 0.1), np.linspace(2, 1, len(xy)))
-    flat = flat_centroids(mixed, np.full(len(xy), 0.2))
-    assert flat.spread_px2.shape == (0, 2, 2)
-    assert (flat.sigma_px > flat.own_px).all()
+    _, own_px, sigma_px, _, spread_px2 = flat_centroids(mixed, np.full(len(xy), 0.2))
+    assert spread_px2.shape == (0, 2, 2)
+    assert (sigma_px > own_px).all()
     solution = eye.solve_centroids(mixed)
     assert (solution.log10_chance < 0) == solution.solved
     assert (
