@@ -69,7 +69,8 @@ def test_an_exported_scene_rests_at_the_shown_attitude(
     at_rest: tuple[Worker, SceneInfo], tmp_path: Path
 ) -> None:
     worker, info = at_rest
-    if info.scene.name == "two_axis_mount":  # it has no other attitudes than those of its profile
+    # It has no other attitudes than those of its profile.
+    if info.scene.name == "two_axis_mount":
         worker.move(0.01, 0.01, 1.0, False)
         assert set(yaml.safe_load(worker.export()["scene.yaml"])) == {"schema", "base"}
         return

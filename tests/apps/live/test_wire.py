@@ -357,7 +357,9 @@ def test_late_periods_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
         clock.now_s = began_s + 0.01 * (periods - 1) + delay_s
         live.advance()
         assert (live.periods, live.missed) == (periods, missed)
-        assert clock.now_s == pytest.approx(began_s + 0.01 * (periods - 1) + max(0.01, delay_s))
+        assert clock.now_s == pytest.approx(
+            began_s + 0.01 * (periods - 1) + max(0.01, delay_s)
+        )
 
 
 class Kept:
