@@ -44,16 +44,16 @@ compile: $(READY)
 	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.helpers.compilation
 
 # Kept bytecode: the tests start some hundred processes, each of which would compile the sources again.
-PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 test: $(READY)
-	$(PYTEST) -m "not slow and not compiles and not long and not browser"
+	$(PYTEST) --dist worksteal -m "not slow and not compiles and not long and not browser"
 
 test-slow: $(READY) $(EXTRA)s3+query
-	$(PYTEST) -m "(slow or compiles) and not long and not browser"
+	$(PYTEST) --dist worksteal -m "(slow or compiles) and not long and not browser"
 
 test-long: $(READY)
-	$(PYTEST) -m long
+	$(PYTEST) --dist worksteal -m long
 
 # What a refactoring must not change: frames, truth, solutions, studies, JSON, streams, surveys, messages. RECORD=1 after
 # an intended change, which goes into tests/baseline/CHANGES.md. AREAS="scenes messages"; ALL=1 adds what takes minutes.
@@ -108,7 +108,7 @@ figures: $(READY)
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY) $(EXTRA)browser
-	$(BIN)/pytest -n 2 --dist loadfile -m browser tests/apps/gui tests/apps/live tests/docs -rs
+	$(PYTEST) --dist loadfile -m browser tests/apps/gui tests/apps/live tests/docs -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
