@@ -7,23 +7,27 @@ LOCK ?=
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK))
 LOWEST := out/lowest
 
+# Extras, e.g. dev+catalog: by uv, in a fifth of pip's time, or by pip, which also reads an index from pip.conf.
+comma := ,
+editable = -e '.[$(subst +,$(comma),$(1))]'
+install = $(BIN)/uv pip install --quiet --python $(BIN)/python $(if $(LOCK),-c $(LOCK)) $(editable) || $(PIP) $(editable)
+
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "skysim needs Python 3.11 or newer")'
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --upgrade pip
-	$(PIP) -e '.[dev,catalog]'
+	$(PIP) uv
+	$(call install,dev+catalog)
 	touch $@
 
-# Extras of single targets, each installed once. `make extras`: all that CI needs, by one call of pip.
+# Extras of single targets, each installed once. `make extras`: all that CI needs, by one call.
 EXTRA := .venv/.extra-
 $(EXTRA)%: $(READY)
-	$(PIP) -e '.[$(subst +,$(comma),$*)]'
+	$(call install,$*)
 	touch $@
 
-comma := ,
 CI_EXTRAS := docs s3+query browser
 extras: $(READY)
-	$(PIP) -e '.[$(subst +,$(comma),$(subst $(eval ) ,$(comma),$(CI_EXTRAS)))]'
+	$(call install,$(subst $(eval ) ,+,$(CI_EXTRAS)))
 	touch $(addprefix $(EXTRA),$(CI_EXTRAS))
 
 .PHONY: compile extras baseline bench accept demo test test-slow test-long oracle test-browser test-lowest lock fuzz fuzzer mutants lint pictures studies papers stale docs figures gui recompile setup clean
@@ -40,16 +44,16 @@ compile: $(READY)
 	NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m tests.helpers.compilation
 
 # Kept bytecode: the tests start some hundred processes, each of which would compile the sources again.
-PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist worksteal
+PYTEST = PYTHONDONTWRITEBYTECODE= NUMBA_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2
 
 test: $(READY)
-	$(PYTEST) -m "not slow and not compiles and not long and not browser"
+	$(PYTEST) --dist worksteal -m "not slow and not compiles and not long and not browser"
 
 test-slow: $(READY) $(EXTRA)s3+query
-	$(PYTEST) -m "(slow or compiles) and not long and not browser"
+	$(PYTEST) --dist worksteal -m "(slow or compiles) and not long and not browser"
 
 test-long: $(READY)
-	$(PYTEST) -m long
+	$(PYTEST) --dist worksteal -m long
 
 # What a refactoring must not change: frames, truth, solutions, studies, JSON, streams, surveys, messages. RECORD=1 after
 # an intended change, which goes into tests/baseline/CHANGES.md. AREAS="scenes messages"; ALL=1 adds what takes minutes.
@@ -104,7 +108,7 @@ figures: $(READY)
 
 # The lab's page in Chromium. Where that is missing the tests say so and are skipped.
 test-browser: $(READY) $(EXTRA)browser
-	$(BIN)/pytest -n 2 --dist loadfile -m browser tests/apps/gui tests/apps/live tests/docs -rs
+	$(PYTEST) --dist loadfile -m browser tests/apps/gui tests/apps/live tests/docs -rs
 
 # Versions that resolve today, for CI; and the tests on the lowest that pyproject.toml allows.
 lock: $(READY)
@@ -124,7 +128,7 @@ fuzz: fuzzer
 	$(BIN)/python -m tests.fuzz $(FUZZ_S)
 
 fuzzer: $(READY)
-	-$(BIN)/pip install --quiet --disable-pip-version-check -e '.[fuzz]'
+	-$(call install,fuzz)
 
 # How many of MUTANTS random small changes of the code the tests notice: docs/findings/mutants.md. It takes an hour, and
 # goes on where it was stopped; `AGAIN=--again` tries the survivors once more, after tests were added. Of some packages
@@ -132,7 +136,7 @@ fuzzer: $(READY)
 MUTANTS ?= 300
 SEED ?= 1
 mutants: $(READY)
-	$(PIP) -e '.[mutants]'
+	$(call install,mutants)
 	$(BIN)/python -m tests.mutants $(MUTANTS) $(SEED) $(PACKAGES) $(AGAIN)
 
 lint: $(READY)

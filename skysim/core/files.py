@@ -274,6 +274,11 @@ def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 
 
+def write_json(path: Path, data: Any) -> None:
+    """Write data as JSON."""
+    write_text(path, to_json(data))
+
+
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
     """Write a file of bytes."""
     with atomic_file(path, memoryview(data).nbytes) as temporary:

@@ -306,7 +306,7 @@ def check_version(tree: Keys, path: Path, text: str) -> None:
         problem = f"version {version} is newer than skysim {__version__} supports"
     elif type(version) is int:
         problem = f"version {version} is no longer supported"
-    raise InputError("schema", problem, VERSION, where_of(["schema"], [(path, text)], {}))
+    raise InputError("schema", problem, VERSION, where_of("schema", [(path, text)], {}))
 
 
 def set_key(tree: Tree, key: str, value: str) -> None:
@@ -428,11 +428,12 @@ def explained(tree: Tree, files: Files, overrides: OverrideTexts) -> Iterator[No
     keys = [str(key) for key in yaml_keys(first["loc"], tree, missing)]
     found = fault_of(first)
     if found.key:
-        keys += found.key.split(".")
+        keys.append(found.key)
+    key = ".".join(keys)
     # 3. A missing key has no line of its own, so the line is that of its section. (A file may have the key in a section
     # or list that another file replaces.)
-    where = where_of(keys[:-1] if missing else keys, files, overrides)
-    raise InputError(excerpt(".".join(keys)), found.problem, found.allowed, where) from None
+    where = where_of(key.rpartition(".")[0] if missing else key, files, overrides)
+    raise InputError(excerpt(key), found.problem, found.allowed, where) from None
 
 
 def fault_of(error: ErrorDetails) -> InputError:
@@ -462,12 +463,11 @@ def fault_of(error: ErrorDetails) -> InputError:
     return InputError("", f"{value} is not allowed", EXPECTED[kind].format(**limits))
 
 
-def where_of(keys: list[str], files: Files, overrides: OverrideTexts) -> Where | None:
-    """The place that sets a key: OVERRIDES, or the line in the file that has most components of the key."""
-    dotted = ".".join(keys)
-    if any(k == dotted or dotted.startswith(k + ".") for k in overrides):
+def where_of(key: str, files: Files, overrides: OverrideTexts) -> Where | None:
+    """The place that sets a dotted key: OVERRIDES, or the line in the file that has most components of the key."""
+    if any(f"{key}.".startswith(f"{one}.") for one in overrides):
         return OVERRIDES
-    matches = [(*line_of(text, keys), path) for path, text in files]
+    matches = [(*line_of(text, key.split(".")), path) for path, text in files]
     # `max` takes the first file of those with equal depth; in Python there may be no file.
     _, line, path = max(matches, key=lambda match: match[0], default=(0, None, None))
     if path and path.name == MAPPING:

@@ -465,7 +465,7 @@ def write_all(
     image = png(lambda fig: draw_flights(fig, statistics, last), (15, 4.5))
     files.write_bytes(picture, image)
     statistics |= {"picture": str(picture), "report": str(folder / "report.html")}
-    files.write_text(folder / "balance.json", files.to_json(statistics))
+    files.write_json(folder / "balance.json", statistics)
     report = balance_report(statistics, image, command)
     report.save(folder / "report.html")
     return report

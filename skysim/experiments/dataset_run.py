@@ -204,7 +204,7 @@ def study_plan(
         refusal = InputError(
             "trial.kind", f"a dataset has frames, not {excerpt(trial)}", "frames"
         )
-        raise refusal.at(where_of(["trial"], [(vary or Path(OVERRIDES.file), text)], {}))
+        raise refusal.at(where_of("trial", [(vary or Path(OVERRIDES.file), text)], {}))
     settings = tree.get("set") or {}
     if not isinstance(settings, dict):
         raise InputError(vary, f"set: {settings!r}", "keys of the scene with their values")

@@ -529,7 +529,7 @@ class Report:
         if path.suffix == ".html":
             files.write_text(path, self.html())
         elif path.suffix == ".json":
-            files.write_text(path, files.to_json(self.json()))
+            files.write_json(path, self.json())
         else:
             pictures = pictures or f"{path.stem}/"
             for name, figure in figure_files(self.blocks):

@@ -380,10 +380,9 @@ def list_scenes() -> list[str]:
 
 def located(error: InputError, name: str, overrides: OverrideTexts) -> InputError:
     """The error with file and line, if it is about a key of the scene that was checked after loading."""
-    keys = error.key.split(".")
-    if error.where or keys[0] not in Scene.model_fields:
+    if error.where or error.key.split(".")[0] not in Scene.model_fields:
         return error
-    return error.at(where_of(keys, read(find(name))[1], overrides))
+    return error.at(where_of(error.key, read(find(name))[1], overrides))
 
 
 class Layer(NamedTuple):
@@ -434,7 +433,7 @@ def layers_of(
     if "base" not in tree:
         return [Layer(path, text, tree)]
     base = tree.pop("base")
-    where = where_of(["base"], [(path, text)], {})
+    where = where_of("base", [(path, text)], {})
     try:
         beside = path.parent / str(base)
         base_path = find(str(beside if is_file(beside) else base))
@@ -467,7 +466,7 @@ def apply_preset(tree: Tree, files: Files, overrides: OverrideTexts) -> Tree:
     try:
         return with_preset(with_heads(tree))
     except InputError as error:
-        raise error.at(where_of(error.key.split("."), files, overrides)) from None
+        raise error.at(where_of(error.key, files, overrides)) from None
 
 
 # Keys whose value may be a file in the scene's folder; * stands for every item of a list.

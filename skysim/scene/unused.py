@@ -46,13 +46,13 @@ def check(
     for key in set_keys(own):
         broken = find(RULES, [key], scene)
         if broken and (not overrides or useless_in_file(key, without_overrides)):
-            raise no_effect(*broken).at(where_of(key.split("."), files, {}))
+            raise no_effect(*broken).at(where_of(key, files, {}))
     # Keys of heads that have no effect in the head's scene.
     for n, head in enumerate(own.get("heads") or () if not overrides else ()):
         sections = {section: head[section] for section in HEAD_SECTIONS if section in head}
         if broken := find(RULES, set_keys(sections), scene.of_head(n)):
             error = no_effect(*broken).under(f"heads.{n}")
-            raise error.at(where_of(error.key.split("."), files, {}))
+            raise error.at(where_of(error.key, files, {}))
 
 
 def check_overrides(scenes: Sequence[Scene], overrides: OverrideTexts) -> None:

@@ -275,10 +275,13 @@ def mosaic(light: View, background_e: float, angle_rad: float) -> tuple[Floats, 
     size = 64
     x, y = np.mgrid[:cells, :cells].reshape(2, -1) * size + size / 2
     centers = np.column_stack([x, y]) + rng.uniform(-0.5, 0.5, (cells**2, 2))
-    # Points of the disk along the path.
-    k = np.arange(60)
-    r = light.disk_px[0] * np.sqrt((k + 0.5) / 60)
-    along = (np.arange(60) + 0.5) / 60 * light.streak_px[0, 0]
+    # Points of the disk along the path: 60 of each, or one where there is none.
+    points_of_disk, points_of_path = (
+        60 if extent_px else 1 for extent_px in (light.disk_px[0], light.streak_px[0, 0])
+    )
+    k = np.arange(points_of_disk)
+    r = light.disk_px[0] * np.sqrt((k + 0.5) / points_of_disk)
+    along = (np.arange(points_of_path) + 0.5) / points_of_path * light.streak_px[0, 0]
     along = (along - along.mean()) * np.array([[np.cos(angle_rad)], [np.sin(angle_rad)]])
     disk = r * np.array([np.cos(2.4 * k), np.sin(2.4 * k)])
     points = (along[:, :, None] + disk[:, None]).reshape(2, -1)

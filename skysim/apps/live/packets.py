@@ -371,7 +371,7 @@ def folder_writer(path: Path) -> Callable[[Packet], None]:
             files.write_bytes(stem.with_suffix(".png"), encode_png(packet.pixels))
         else:
             files.write_bytes(stem.with_suffix(".raw"), packet.pixels.tobytes())
-        files.write_text(stem.with_suffix(".json"), files.to_json(packet.header_with_truth))
+        files.write_json(stem.with_suffix(".json"), packet.header_with_truth)
 
     return write
 

@@ -298,8 +298,7 @@ def shell_m(inside: Surface, cap_rad: float) -> Floats:
 
     def points_at(polar: Floats) -> Floats:
         """(..., 3) points at these polar angles (..., SECTORS)."""
-        rays = surface.directions(polar, azimuth)
-        return inside.meet(np.zeros(3), rays.reshape(-1, 3)).reshape(rays.shape)
+        return inside.from_bearing(surface.directions(polar, azimuth))
 
     # 2. The first and the last ray in each direction that meets the surface. A wall that begins below the cap has none.
     for lowest_rad in (

@@ -390,7 +390,7 @@ def write_results(
         "night": night_statistics(config, night) if night else None,
         "remarks": found.remarks + (night.remarks if night else []),
     }
-    files.write_text(folder / "characterize.json", files.to_json(statistics))
+    files.write_json(folder / "characterize.json", statistics)
     report = characterize_report(statistics, config, found, night)
     report.save(folder / "report.html")
     return statistics, report

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from skysim.core.files import make_folder, to_json, write_bytes, write_text
+from skysim.core.files import make_folder, write_bytes, write_json
 from skysim.core.paths import DATA
 from skysim.core.types import Floats, Record
 from skysim.experiments.datasheet import performance, variance_components
@@ -388,6 +388,6 @@ def write_all(folder: Path, statement: Statement, report: Report) -> dict[str, P
     for name, figure in figure_files(report.blocks):
         write_bytes(folder / name, figure.image)
     paths = {"json": folder / "datasheet.json", "report": folder / "datasheet.html"}
-    write_text(paths["json"], to_json(numbers(statement)))
+    write_json(paths["json"], numbers(statement))
     report.save(paths["report"])
     return paths

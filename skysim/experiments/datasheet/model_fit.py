@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import stats
 
-from skysim.core.files import make_folder, to_json, write_text
+from skysim.core.files import make_folder, write_json, write_text
 from skysim.core.paths import DATA
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Floats, Record
@@ -315,7 +315,7 @@ def write_model(folder: Path, constants: Record) -> list[Path]:
     """Write the module and its constants to a folder; return their paths."""
     paths = [make_folder(folder) / MODULE, folder / CONSTANTS]
     write_text(paths[0], (HERE / "error_model.py").read_text(encoding="utf-8"))
-    write_text(paths[1], to_json(constants))
+    write_json(paths[1], constants)
     return paths
 
 

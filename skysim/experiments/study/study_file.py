@@ -126,8 +126,8 @@ def plan_of(
             within = [key for key in study.set if f"{error.key}.".startswith(f"{key}.")]
             if error.key == InputError(study.scene, "").key:
                 error = error.within("scene")
-            keys = ["set", *within] if within else error.key.split(".")
-            error = error.at(where_of(keys, [(path, text)], {}))
+            key = f"set.{within[0]}" if within else error.key
+            error = error.at(where_of(key, [(path, text)], {}))
         raise error from None
     return plan
 

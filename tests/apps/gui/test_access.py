@@ -277,31 +277,36 @@ SCROLLED = """() => { const root = document.documentElement, found = [];
   return found; }"""  # what has a horizontal scroll bar
 
 
-@pytest.mark.browser
-@in_browser
-@pytest.mark.parametrize("zoom", [1, 2])
-def test_nothing_scrolls_sideways_at_any_width(
-    browser: Any, server: Server, zoom: int
-) -> None:
-    """With scroll bars that take room, which Playwright hides otherwise; at 200 % a window has half its pixels."""
-    sizes = [(width, 900) for width in range(420, 1921, 60)]
-    sizes += [(899, 800), (900, 800), (1000, 700), (1001, 700), (1440, 900), (1920, 1080)]
-    if zoom == 2:
-        sizes = [(width // 2, height // 2) for width, height in sizes if width >= 840]
+@pytest.fixture(scope="module")
+def with_scroll_bars(browser: Any, server: Server) -> Iterator[Any]:
+    """A tab with scroll bars that take room, which Playwright hides otherwise."""
     chromium = browser.browser_type.launch(
         executable_path=CHROMIUM,
         args=["--no-sandbox", "--enable-unsafe-swiftshader"],
         ignore_default_args=["--hide-scrollbars"],
     )
-    faults = set()
     with opened(chromium, server.login, NARROW) as page:
-        for name in PANELS:
-            panel(page, name)
-            for width, height in sizes:
-                page.set_viewport_size({"width": width, "height": height})
-                page.wait_for_timeout(60)
-                faults |= {(name, width, one) for one in page.evaluate(SCROLLED)}
-            pictured(page, f"width_{zoom}_{name.replace(' ', '_')}")
-            page.evaluate("document.querySelector('.nicegui-content').scrollTo(0, 0)")
+        yield page
     chromium.close()
+
+
+@pytest.mark.browser
+@in_browser
+@pytest.mark.parametrize("zoom", [1, 2])
+def test_nothing_scrolls_sideways_at_any_width(with_scroll_bars: Any, zoom: int) -> None:
+    """At 200 % a window has half its pixels."""
+    page = with_scroll_bars
+    sizes = [(width, 900) for width in range(420, 1921, 60)]
+    sizes += [(899, 800), (900, 800), (1000, 700), (1001, 700), (1440, 900), (1920, 1080)]
+    if zoom == 2:
+        sizes = [(width // 2, height // 2) for width, height in sizes if width >= 840]
+    faults = set()
+    for name in PANELS:
+        panel(page, name)
+        for width, height in sizes:
+            page.set_viewport_size({"width": width, "height": height})
+            page.wait_for_timeout(60)
+            faults |= {(name, width, one) for one in page.evaluate(SCROLLED)}
+        pictured(page, f"width_{zoom}_{name.replace(' ', '_')}")
+        page.evaluate("document.querySelector('.nicegui-content').scrollTo(0, 0)")
     assert not faults

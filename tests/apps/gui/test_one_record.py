@@ -12,7 +12,7 @@ import pytest
 import yaml
 from astropy.table import Table
 
-from skysim.apps.gui.messages import FlightRow
+from skysim.apps.gui.messages import FlightRow, SceneInfo
 from skysim.apps.gui.page.run_panel import flight_table
 from skysim.apps.gui.page.strips import rms_line
 from skysim.apps.gui.worker.geometry import RANGES
@@ -48,17 +48,6 @@ def test_a_flight_s_rows_are_those_of_the_command_line(name: str) -> None:
         np.testing.assert_array_equal(table[column], expected[column])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_typed_angles_are_the_shown_ones(name: str) -> None:
-    worker = Worker()
-    info, _ = worker.open(name, FEWER.get(name, {}), False)
-    typed = (3.0, 2.0, 1.0)
-    assert all(RANGES[angle][0] <= 1.0 for angle in info.names)
-    view = worker.point(typed, False)
-    np.testing.assert_allclose(view.angles_deg, typed, rtol=0, atol=1e-9)
-
-
 def test_a_wrong_attitude_is_counted_in_the_flight_s_line() -> None:
     fine = solution((), cross_arcsec=3.0, roll_arcsec=4.0).row
     wrong = solution((), cross_arcsec=9000.0, roll_arcsec=0.0, wrong=True).row
@@ -67,13 +56,21 @@ def test_a_wrong_attitude_is_counted_in_the_flight_s_line() -> None:
     assert rms_line(rows).startswith("2 of 3 frames solved, 1 wrong;")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
-def test_an_exported_scene_rests_at_the_shown_attitude(name: str, tmp_path: Path) -> None:
-    overrides = FEWER.get(name, {})
+@pytest.fixture(scope="module", params=NAMES)
+def at_rest(request: pytest.FixtureRequest) -> tuple[Worker, SceneInfo]:
+    """The worker of a page on which a scene was opened; the tests move it in their order."""
     worker = Worker()
-    worker.open(name, overrides, False)
-    if name == "two_axis_mount":  # it has no other attitudes than those of its profile
+    info, _ = worker.open(request.param, FEWER.get(request.param, {}), False)
+    return worker, info
+
+
+@pytest.mark.slow
+def test_an_exported_scene_rests_at_the_shown_attitude(
+    at_rest: tuple[Worker, SceneInfo], tmp_path: Path
+) -> None:
+    worker, info = at_rest
+    # It has no other attitudes than those of its profile.
+    if info.scene.name == "two_axis_mount":
         worker.move(0.01, 0.01, 1.0, False)
         assert set(yaml.safe_load(worker.export()["scene.yaml"])) == {"schema", "base"}
         return
@@ -88,6 +85,15 @@ def test_an_exported_scene_rests_at_the_shown_attitude(name: str, tmp_path: Path
     (shot, *_) = flight.shots(solves=False)
     truth_deg = scoring.true_angles_deg(shot.camera, shot.truth)
     np.testing.assert_allclose(truth_deg, shown.angles_deg, rtol=0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_typed_angles_are_the_shown_ones(at_rest: tuple[Worker, SceneInfo]) -> None:
+    worker, info = at_rest
+    typed = (3.0, 2.0, 1.0)
+    assert all(RANGES[angle][0] <= 1.0 for angle in info.names)
+    view = worker.point(typed, False)
+    np.testing.assert_allclose(view.angles_deg, typed, rtol=0, atol=1e-9)
 
 
 @pytest.mark.slow

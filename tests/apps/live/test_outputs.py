@@ -32,6 +32,7 @@ from skysim.apps.live.packets import Packet, unpack
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import Flight, open_flight
+from tests.helpers.clock import FakeClock
 
 FRAMES = 4
 OVERRIDES = {"exposure.frames": str(FRAMES), "light.limit_mag": "5"}
@@ -96,22 +97,6 @@ def test_packets_round_trip_and_a_truncated_one_is_an_error(dtype: str) -> None:
 def test_invalid_headers_are_rejected_before_the_pixels_are_read(line: bytes) -> None:
     with pytest.raises(InputError, match="not a packet of skysim live"):
         unpack(io.BytesIO(line + b"x" * 64))
-
-
-class FakeClock:
-    """A wall clock that only `sleep` advances."""
-
-    def __init__(self) -> None:
-        self.now_s = 100.0
-
-    def monotonic(self) -> float:
-        return self.now_s
-
-    def time(self) -> float:
-        return 1e9 + self.now_s
-
-    def sleep(self, seconds: float) -> None:
-        self.now_s += seconds
 
 
 def test_a_frame_is_sent_when_due_and_dropped_one_period_later(

@@ -3,7 +3,6 @@
 import json
 import socket
 import threading
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -18,6 +17,7 @@ from skysim.apps.live.wire import WireServer
 from skysim.core.errors import InputError
 from skysim.scene import loader
 from skysim.simulation.flight import open_flight
+from tests.helpers.clock import FakeClock
 
 FREE = {"exposure.frames": "20", "motion.maneuver": "[{kind: hold, duration: 20 s}]"}
 
@@ -343,15 +343,23 @@ def estimate_error_deg(live: Live) -> float:
     return float(np.degrees(2 * np.arccos(min(1.0, abs(wxyz @ true_wxyz)))))
 
 
-def test_late_periods_are_counted() -> None:
+def test_late_periods_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Late by a period of 10 ms or more."""
+    clock = FakeClock()
+    monkeypatch.setattr("skysim.apps.live.pacing.time", clock)
     live = live_flight()
     live.pace = Pace(1.0, 2.0)
     live.pace.start(0.0)
-    live.advance()
-    assert live.missed == 0
-    time.sleep(0.05)
-    live.advance()
-    assert (live.periods, live.missed) == (2, 1)
+    began_s = clock.now_s
+    for periods, (delay_s, missed) in enumerate(
+        [(0.0, 0), (0.0101, 0), (0.0199, 0), (0.0201, 1)], 1
+    ):
+        clock.now_s = began_s + 0.01 * (periods - 1) + delay_s
+        live.advance()
+        assert (live.periods, live.missed) == (periods, missed)
+        assert clock.now_s == pytest.approx(
+            began_s + 0.01 * (periods - 1) + max(0.01, delay_s)
+        )
 
 
 class Kept:

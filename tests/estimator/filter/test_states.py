@@ -16,7 +16,7 @@ from tests.helpers.tumble import tumble_angle_rad, tumble_body_from_ref
 ARCSEC_RAD = np.pi / 180 / 3600
 ARW_RAD_SQRT_S = np.radians(0.07) / 60
 RATE_HZ = 50
-SECONDS = 20
+SECONDS = 12
 RUNS = 200
 NOISE_RAD2 = np.diag([10.0, 10.0, 60.0]) ** 2 * ARCSEC_RAD**2
 GYRO = GyroModel(ARW_RAD_SQRT_S, 0.0, np.inf)

@@ -91,6 +91,10 @@ def test_an_override_changes_the_study(tmp_path):
         ),
         (("noise_px: 0.1", "noise_px: -1"), r"trial.*noise_px.*line 6\)"),
         (
+            ("{exposure.frames: 1}", "\n  exposure.frames: 2\n  camera.f_number: -2"),
+            r"camera.f_number: -2 is not allowed.*line 7\)",
+        ),
+        (
             ("kind: centroids", "kind: guesses"),
             r"trial.kind: unknown kind 'guesses'; allowed:",
         ),

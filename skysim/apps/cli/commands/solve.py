@@ -117,7 +117,7 @@ def solve(
     results, messages, all_read = solve_all(paths, settings, chosen, out, json)
     if sequence:
         plate_solver.add_rates(results, rate or video_numbers(paths[0])[0])
-    files.write_text(out / "solutions.json", files.to_json(results))
+    files.write_json(out / "solutions.json", results)
     if json:
         print_json(results)
     else:

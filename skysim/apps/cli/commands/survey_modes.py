@@ -323,7 +323,7 @@ def write_report(request: Request, run: SurveyRun, statistics: Record) -> Record
     statistics |= {"report": str(path)}
     report = survey_report.survey_report(statistics, run, command_line())
     report.save(path)
-    files.write_text(request.folder / "survey.json", files.to_json(statistics))
+    files.write_json(request.folder / "survey.json", statistics)
     if not request.quiet:
         report.print()
         print(
