@@ -1,7 +1,7 @@
 """The detector model: mean photo-electrons to digital numbers, one function per step, in the order of the signal.
 
 1. `smear`: light that frame-transfer and interline chips collect while charge moves.
-2. PRNU and dark current scale and add to the mean; Poisson counting (`_count_row`).
+2. PRNU and dark current scale and add to the mean; Poisson counting (`noise.count`).
 3. Ionizing particles (cosmic_rays.py).
 4. Full well: charge above it blooms along the column or is lost.
 5. Charge-transfer loss (charge_transfer.py).
@@ -30,7 +30,7 @@ from numpy.random import Generator
 from numpy.typing import NDArray
 
 from skysim.camera import charge_transfer, cosmic_rays, noise
-from skysim.core.jit import jit
+from skysim.core.jit import jit, loop
 from skysim.core.random_streams import random_stream
 from skysim.core.types import Bools, Singles, SourceTruth, frozen
 from skysim.scene.sections.camera import (
@@ -68,7 +68,7 @@ class AddedCharge:
         self.masks[name] = before > self.threshold_e
 
 
-ROWS = 16  # rows that share one buffer for their random numbers
+ROWS = 16  # rows that share one buffer for their random numbers, and go from step to step together
 
 
 @frozen
@@ -168,14 +168,19 @@ def expose(
     config = detector.config
     if not config.noise:
         return expectation(light_e, exposure_s, detector)
-    # Seeds of the rows' streams, for counting and for read noise.
-    count_seeds = noise.seeds(rng, len(light_e))
-    read_seeds = noise.seeds(rng, len(light_e))
-    constants = readout_constants(config, exposure_s)
-    guide = noise.guide()
-    pattern = (detector.sensitivity, detector.dark_e_s, detector.column_offset_e)
     frame = np.empty(light_e.shape, np.uint16)
-    rows = (light_e, *pattern, constants, count_seeds, read_seeds, guide, frame)
+    rows = (
+        light_e,
+        detector.sensitivity,
+        detector.dark_e_s,
+        detector.column_offset_e,
+        readout_constants(config, exposure_s),
+        # Seeds of the rows' streams, for counting and for read noise.
+        noise.seeds(rng, len(light_e)),
+        noise.seeds(rng, len(light_e)),
+        noise.guide(),
+        frame,
+    )
     # With no step between counting and read-out, one pass does both, with the same numbers.
     if not (
         config.particles
@@ -280,7 +285,7 @@ class ReadoutConstants(NamedTuple):
 
 
 def readout_constants(config: DetectorConfig, exposure_s: float) -> ReadoutConstants:
-    """The parameters that `_count_row` and `_read_row` need, in single precision."""
+    """The parameters that `_mean_row` and `_read_row` need, in single precision."""
     # In the order of the fields.
     values = (
         exposure_s,
@@ -294,17 +299,9 @@ def readout_constants(config: DetectorConfig, exposure_s: float) -> ReadoutConst
     return ReadoutConstants(*map(np.float32, values))
 
 
-@jit
-def _count_row(
-    row: Any,
-    sensitivity: Any,
-    dark_e_s: Any,
-    constants: ReadoutConstants,
-    seed: Any,
-    guide: Any,
-    memory: noise.Scratch,
-) -> None:
-    """Count the electrons of one row, light and dark current together, in place.
+@loop
+def _mean_row(row: Any, sensitivity: Any, dark_e_s: Any, constants: ReadoutConstants) -> None:
+    """The expected electrons of one row, light and dark current together, in place.
 
     n ~ Poisson(sensitivity light + dark t): variance equal to the mean. PRNU is a pixel's relative quantum efficiency,
     so it scales the mean, and the sum of light and dark current stays a Poisson variable.
@@ -312,10 +309,9 @@ def _count_row(
     for x in range(row.size):
         # Interpolated images may be slightly negative (about 1e-6).
         row[x] = max(row[x], float32(0)) * sensitivity[x] + dark_e_s[x] * constants.exposure_s
-    noise.count(row, seed, guide, memory)
 
 
-@jit
+@loop
 def _read_row(
     row: Any,
     offset_e: Any,
@@ -358,20 +354,22 @@ def _convert(
 ) -> None:
     """Count a frame's electrons in place, or read them to digital numbers, blocks of rows in parallel; or both at once.
 
-    Both at once is faster, but only for chips on which no charge leaves its row in between. See `_count_row` and
-    `_read_row`.
+    Both at once is faster, but only for chips on which no charge leaves its row in between. See `_mean_row`,
+    `noise.count` and `_read_row`.
     """
     height, width = electrons.shape
     for block in numba.prange((height + ROWS - 1) // ROWS):
         memory = noise.scratch(width)
-        for y in range(block * ROWS, min((block + 1) * ROWS, height)):
-            row = electrons[y]
-            if counts:
-                _count_row(
-                    row, sensitivity[y], dark_e_s[y], constants, count_seeds[y], guide, memory
-                )
-            if reads:
-                _read_row(row, offset_e, constants, read_seeds[y], memory, frame[y])
+        rows = range(block * ROWS, min((block + 1) * ROWS, height))
+        if counts:
+            # The means of all rows first: long passes over memory are faster.
+            for y in rows:
+                _mean_row(electrons[y], sensitivity[y], dark_e_s[y], constants)
+            for y in rows:
+                noise.count(electrons[y], count_seeds[y], guide, memory)
+        if reads:
+            for y in rows:
+                _read_row(electrons[y], offset_e, constants, read_seeds[y], memory, frame[y])
 
 
 def saturation_dn(config: DetectorConfig) -> float:

@@ -27,7 +27,7 @@ from numba.cpython.unsafe.numbers import trailing_zeros
 from numpy.random import Generator
 from numpy.typing import NDArray
 
-from skysim.core.jit import jit
+from skysim.core.jit import jit, loop
 from skysim.core.types import Singles
 
 BUCKETS = 1024  # ten bits; the rows of a dark frame's means then fit the L2 cache
@@ -149,7 +149,7 @@ def _mixed(state: Any) -> Any:
     return z ^ (z >> uint64(31))
 
 
-@jit
+@loop
 def _draws(bits: Any, state: Any) -> Any:
     """Fill an array with the stream's next 64-bit numbers. Returns the stream's next state."""
     for n in range(bits.size):
@@ -164,7 +164,7 @@ def _uniform(state: Any) -> Any:
     return (float64(int64(_mixed(state) >> uint64(12))) + 0.5) * 2.0**-52, state
 
 
-@jit
+@loop
 def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
     """Turn a row of means >= 0 into Poisson counts, exactly, in place. Returns the stream's next state.
 
@@ -213,17 +213,13 @@ def count(row: Any, state: Any, guide: Any, memory: Scratch) -> Any:
                     float64(row[x]), (float64(int64(words[x] >> uint16(6))) + more) / BUCKETS
                 )
             )
-    # 4. Write the counts to the row. Without large means, use a loop without a branch.
-    if large == 0:
-        for x in range(width):
-            row[x] = float32(found[x])
-        return state
+    # 4. Write the counts to the row.
     for x in range(width):
         row[x] = row[x] if found[x] == LARGE else float32(found[x])
-    return _count_large(row, late[:large], state, memory)
+    return _count_large(row, late[:large], state, memory) if large else state
 
 
-@jit
+@loop
 def _marked(found: Any, late: Any) -> int:
     """Write the indices of the entries with the highest bit to `late`, in order; return their number.
 
@@ -247,6 +243,11 @@ def _invert(mean: Any, u: Any) -> Any:
     n = 0.0
     p = exp(-mean)
     total = p
+    # The first steps without branches, most of which would be mispredicted.
+    for k in range(1, 6):
+        n += u >= total
+        p *= mean / k
+        total += p
     while u >= total and n < LARGE_BIT - 1:
         n += 1.0
         p *= mean / n
@@ -254,7 +255,7 @@ def _invert(mean: Any, u: Any) -> Any:
     return n
 
 
-@jit
+@loop
 def _count_large(row: Any, pixels: Any, state: Any, memory: Scratch) -> Any:
     """Poisson counts for the chosen pixels of a row, with means of at least ten, by PD.
 
@@ -362,7 +363,7 @@ def _densities(mean: float, sigma: float, k: float) -> Any:
     return px, py, -x2 / 2, fy
 
 
-@jit
+@loop
 def normal(row: Any, state: Any, memory: Scratch) -> Any:
     """Fill a row with standard normal numbers (Box & Muller 1958). Returns the stream's next state.
 
@@ -458,7 +459,7 @@ def _direction(word: Any) -> Any:
     return sign * (-y if turned else x), sign * (x if turned else y)
 
 
-@jit
+@loop
 def _lengthen(radius: Any, words: Any, state: Any) -> Any:
     """Give the smallest u, which have too few bits, more of them and set their radii. Returns the next state."""
     for n in range(radius.size):

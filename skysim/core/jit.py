@@ -18,6 +18,9 @@ from skysim.core import errors
 jit = partial(
     numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True
 )
+# For functions that make no array and return none: their arrays' references are not counted. Each count is locked, and
+# waits until all numbers before it are in memory.
+loop = partial(jit, _nrt=False)
 
 
 class CompilationNotice(event.Listener):

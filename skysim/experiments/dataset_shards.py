@@ -560,7 +560,9 @@ def parquet(columns: Record) -> bytes:
         import pyarrow
         import pyarrow.parquet
     sink = pyarrow.BufferOutputStream()
-    pyarrow.parquet.write_table(pyarrow.table(columns), sink, compression="zstd")
+    pyarrow.parquet.write_table(
+        pyarrow.table(columns), sink, compression="zstd", use_dictionary=False
+    )
     return bytes(sink.getvalue())
 
 

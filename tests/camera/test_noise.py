@@ -132,6 +132,16 @@ def test_noise_of_neighbors_and_rows_is_independent() -> None:
             assert abs(r) < 4.5 / np.sqrt(a.size)
 
 
+@pytest.mark.parametrize("mean", [0.003, 0.8, 4.9, 5.1, 15.99])
+def test_the_count_of_a_uniform_number_is_the_quantile_of_the_law(mean: float) -> None:
+    """Also where it takes more steps than the few without branches, and at the ends of every step."""
+    ends = stats.poisson.cdf(np.arange(40), mean)
+    ends = ends[ends < 1 - 1e-12]
+    uniform = np.concatenate([[0.0], ends * (1 - 1e-13), ends * (1 + 1e-13), ends[1:] / 2])
+    counts = [noise._invert(mean, u) for u in uniform]
+    np.testing.assert_array_equal(counts, np.searchsorted(ends, uniform, side="right"))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 1.0])
 def test_marked_entries_are_found_in_order(share: float) -> None:
     rng = np.random.default_rng(6)
