@@ -57,6 +57,19 @@ def test_a_list_of_files_loads_no_library(command: list[str]) -> None:
     assert done.stdout.splitlines()[-1] == "set()"
 
 
+def test_scenes_are_validated_without_libraries_of_pictures_and_tables() -> None:
+    script = (
+        "import sys\nfrom skysim.apps.cli.main import app\n"
+        "app(['validate', 'shefex2', 'afit_simsat'], standalone_mode=False)\n"
+        "libraries = {'astropy', 'cv2', 'jinja2', 'matplotlib', 'pandas', 'PIL', 'rich', 'skimage'}\n"
+        "print(libraries & set(sys.modules))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.splitlines()[-1] == "set()"
+
+
 def test_a_run_is_a_sequence_of_scored_frames(run) -> None:
     assert len(run) == 3
     assert [frame.row.frame for frame in run] == [0, 1, 2]

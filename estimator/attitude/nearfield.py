@@ -25,7 +25,6 @@ raise ValueError if the rays do not determine an attitude.
 
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -305,6 +304,8 @@ def pnp(
     ValueError
         For LEDs in a line, and if the fit does not converge.
     """
+    import cv2  # slow to import
+
     if len(rays_cam) < 4:
         raise ValueError(
             f"pnp: {len(rays_cam)} rays do not determine the camera's position; 4 are needed"

@@ -22,7 +22,6 @@ from functools import lru_cache
 from math import hypot
 from typing import Any, NamedTuple
 
-import cv2
 import numba
 import numpy as np
 from numba import float32, int32
@@ -267,6 +266,8 @@ def repel(light_e: NDArray, config: DetectorConfig) -> None:
     Poisson's; on real chips a bright flat varies less.
     """
     if config.brighter_fatter_per_e:
+        import cv2  # slow to import
+
         held_e = np.minimum(light_e, config.full_well_e)
         flow = cv2.Laplacian(held_e * held_e, -1, borderType=cv2.BORDER_REPLICATE)
         light_e += config.brighter_fatter_per_e / 2 * flow

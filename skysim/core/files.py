@@ -13,7 +13,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
 from skysim.core.errors import InputError, Where, shortened
@@ -161,10 +160,6 @@ def write_png16(path: Path, image_dn: Array) -> None:
     write_image(path, numbers)
 
 
-# Some readers do not support compressed TIFF.
-UNCOMPRESSED_TIFF = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)
-
-
 def write_image(path: Path, image: Array) -> None:
     """Write an image in the format of the path's suffix.
 
@@ -175,8 +170,12 @@ def write_image(path: Path, image: Array) -> None:
     OSError
         If it cannot be written.
     """
+    import cv2  # slow to import
+
+    # Some readers do not support compressed TIFF.
+    uncompressed = (cv2.IMWRITE_TIFF_COMPRESSION, cv2.IMWRITE_TIFF_COMPRESSION_NONE)
+    options = uncompressed if path.suffix == ".tif" else ()
     # Encode in memory, because OpenCV does not report why a file cannot be written.
-    options = UNCOMPRESSED_TIFF if path.suffix == ".tif" else ()
     try:
         encoded, data = cv2.imencode(path.suffix, image, options)
     except cv2.error:

@@ -72,13 +72,14 @@ def ring(arm_m: Floats, offset_m: Floats, lab: Lab) -> View:
         row,
         xy_px,
         offset_m,
-        arm_m,
         gradient,
+        np.cross(arm_m[:, None], gradient),
         depth_m,
         *[nothing] * 4,
         streak,
         nothing,
         behind,
+        np.zeros((count, 2, 2)),
     )
 
 
@@ -163,7 +164,8 @@ def test_a_rotated_survey_rotates_the_solution_equally(leds: Lab) -> None:
     """Exactly: it is the rotation that the tracker measures."""
     circle = under_ring(leds)
     turn_rad = np.array([2e-4, -1e-4, 3e-4])
-    shift_px = np.einsum("nij,nj->ni", circle.gradient, np.cross(turn_rad, circle.arm_m))
+    arm_m = around(RING_M, HEIGHT_M)
+    shift_px = np.einsum("nij,nj->ni", circle.gradient, np.cross(turn_rad, arm_m))
     matrix = of_common(gains(circle, px2(np.ones(LEDS))), shift_px[:, :, None])
     np.testing.assert_allclose(matrix, np.outer(turn_rad, turn_rad), rtol=1e-6, atol=1e-16)
 
@@ -238,7 +240,7 @@ def images(
         row,
         zero[:, None] + np.zeros(2),
         places,
-        places,
+        gradient,
         gradient,
         one,
         electrons * one,
@@ -248,6 +250,7 @@ def images(
         streak,
         zero,
         row,
+        np.zeros((1, 2, 2)),
     )
 
 
@@ -342,7 +345,7 @@ def test_every_centroider_scatters_as_forecast(
     turned = error @ np.array(
         [[np.cos(angle_rad), -np.sin(angle_rad)], [np.sin(angle_rad), np.cos(angle_rad)]]
     )
-    forecast = np.sqrt(np.diag(detection.centroid_variance(light, context, prnu=0.0)[0]))
+    forecast = np.sqrt(np.diag(detection.with_noise(light, context, prnu=0.0).noise_px2[0]))
     assert turned.std(axis=0) == pytest.approx(forecast, rel=0.22)
 
 
@@ -735,6 +738,16 @@ def test_expected_errors_match_solved_frames(
     assert 0.65 < roll < 1.7
     rms, expectation = (np.sqrt(np.mean(values**2, axis=0)) for values in (errors, wanted))
     np.testing.assert_allclose(rms, expectation, rtol=0.3)
+
+
+def test_lights_in_use_have_the_noise_of_their_own_centroids(stars: Lab) -> None:
+    context = detection.context_of(stars)
+    used = sampling.sampled(attitudes.of_frames(stars), context).used
+    assert sum(map(len, used)) > 10
+    for lights in used:
+        own = detection.with_noise(lights, context)
+        np.testing.assert_array_equal(lights.noise_px2, own.noise_px2)
+        assert (np.linalg.eigvalsh(lights.noise_px2) > 0).all()
 
 
 def test_the_expected_error_is_nan_with_two_lights(stars: Lab) -> None:

@@ -204,11 +204,14 @@ def test_drift_is_a_rotation_of_the_mount_and_a_shift_of_the_dome(
     )
     view = plan.frames.used[0]
     distance_m, arm_m = (
-        np.median(np.linalg.norm(one, axis=1)) for one in (view.offset_m, view.arm_m)
+        np.median(np.linalg.norm(one, axis=1))
+        for one in (view.offset_m, plan.beliefs.lights.xyz[view.row])
     )
     moved_px = as_built(view, plan)
     assert moved_px is not None
-    turn_rad = np.einsum("nij,njk->i", gains(view, believed_px2(view, plan)), moved_px)
+    floor_px = plan.settings.centroid_sigma_px
+    believed = believed_px2(view, plan, floor_px)
+    turn_rad = np.einsum("nij,njk->i", gains(view, believed), moved_px)
     turn = turn_rad / ARCSEC_RAD
     if any(mount):
         np.testing.assert_allclose(

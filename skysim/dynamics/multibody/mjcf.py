@@ -27,6 +27,8 @@ from skysim.core.guarded import run_guarded
 from skysim.core.paths import SCENES
 from skysim.core.yaml_reader import excerpt, is_file
 
+LAB_CAMERA = "lab"  # camera of an exported file that sees the whole laboratory
+
 # 1. Files that a model names, and its numbers.
 
 # Elements that name XML files. They are in lower case, since MuJoCo also reads <INCLUDE>.

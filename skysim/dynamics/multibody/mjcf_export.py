@@ -31,9 +31,8 @@ from skysim.core.types import (
     normalized,
 )
 from skysim.dynamics.multibody.integrator import Simulation
-from skysim.dynamics.multibody.mjcf import MujocoWarnings, compile_spec
+from skysim.dynamics.multibody.mjcf import LAB_CAMERA, MujocoWarnings, compile_spec
 from skysim.dynamics.multibody.model import VehicleModel, camera_mount
-from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import CameraConfig
 from skysim.scene.sections.light import RoomConfig

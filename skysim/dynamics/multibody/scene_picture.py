@@ -19,11 +19,10 @@ from skysim.core.errors import InputError, unknown_name
 from skysim.core.files import atomic_file
 from skysim.core.guarded import GL_OFF, PYTHON
 from skysim.core.types import Array, Floats
-from skysim.dynamics.multibody.mjcf import MujocoWarnings, one_line
+from skysim.dynamics.multibody.mjcf import LAB_CAMERA, MujocoWarnings, one_line
 
 Picture = Array[np.uint8]
 
-LAB_CAMERA = "lab"  # camera of the MJCF that sees the whole laboratory
 # Width and height.
 PICTURE_PX = (960, 720)
 FILM_PX = (480, 360)

@@ -6,9 +6,8 @@ import mujoco
 import numpy as np
 
 from skysim.core.types import Array, Floats
-from skysim.dynamics.multibody.mjcf import MujocoWarnings
+from skysim.dynamics.multibody.mjcf import LAB_CAMERA, MujocoWarnings
 from skysim.dynamics.multibody.mjcf_export import GROUP_HIDDEN, mesh_arrays
-from skysim.dynamics.multibody.scene_picture import LAB_CAMERA
 
 KINDS = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",

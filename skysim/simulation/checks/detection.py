@@ -1,9 +1,9 @@
 """Prediction of detections and centroids: the lights that the tracker detects, and the covariance of their positions.
 
 1. `threshold_e` is the detection threshold of the scene's detector.
-2. `detected_area_px` is the area of an image above the threshold.
+2. `detected_px` is the extent of an image above the threshold.
 3. `usable` selects the lights that are detected.
-4. `centroid_variance` predicts the covariance of their centroids.
+4. `with_noise` predicts the covariance of their centroids.
 """
 
 import math
@@ -172,10 +172,10 @@ def detected_radius_px(view: View, context: Context) -> Floats:
     return np.where(log_ratio > 0, radius, 0.0)
 
 
-def detected_area_px(view: View, context: Context) -> Floats:
-    """(n,) area pi r^2 + 2 r L in px^2 of each image above the detection threshold, on a path of length L."""
+def detected_px(view: View, context: Context) -> tuple[Floats, Floats]:
+    """(n,) `detected_radius_px` r of each image, and its area pi r^2 + 2 r L in px^2, on a path of length L."""
     radius = detected_radius_px(view, context)
-    return np.pi * radius**2 + 2 * radius * view.streak_length_px
+    return radius, np.pi * radius**2 + 2 * radius * view.streak_length_px
 
 
 def end_sigma_px(view: View, context: Context) -> Floats:
@@ -225,16 +225,17 @@ def usable(view: View, context: Context) -> View:
     # Distance of each image from the nearest edges, which must exceed its half size.
     far_px = np.array(config.size_px) - 1 - view.xy_px
     edge = np.minimum(view.xy_px, far_px)
-    half_px = np.abs(view.streak_px) / 2 + detected_radius_px(view, context)[:, None]
-    large = detected_area_px(view, context) >= settings.min_area_px
+    radius_px, area_px2 = detected_px(view, context)
+    half_px = np.abs(view.streak_px) / 2 + radius_px[:, None]
+    large = area_px2 >= settings.min_area_px
     found = np.flatnonzero(large & (edge > half_px).all(axis=1))
     return view.take(
         found[np.argsort(-view.electrons[found], kind="stable")][: settings.max_blobs]
     )
 
 
-def centroid_variance(view: View, context: Context, prnu: float | None = None) -> Floats:
-    """(n, 2, 2) covariance of the centroids in px^2: the sum of
+def with_noise(view: View, context: Context, prnu: float | None = None) -> View:
+    """The lights with the covariances of their centroids: the sum of
 
     1. photon noise, and background noise of b electrons^2 a pixel. For a center of gravity in a window of sides A along
        and B across an axis it is sigma^2 / N + b A^3 B / (12 N^2), with sigma^2 increased by L^2 / 12 along the path;
@@ -286,10 +287,11 @@ def centroid_variance(view: View, context: Context, prnu: float | None = None) -
     along_path = unit[:, :, None] * unit[:, None, :]
     # 4. Timing.
     moved = (view.streak_px / lab.scene.exposure.time_s) * context.timing_s[view.row, None]
-    return (
+    return View(
+        *view[:-1],
         ((across + pattern + plateau)[:, None] + floor)[:, :, None] * np.eye(2)
         + (along - across)[:, None, None] * along_path
-        + moved[:, :, None] * moved[:, None, :]
+        + moved[:, :, None] * moved[:, None, :],
     )
 
 
@@ -385,9 +387,9 @@ def shapes_of(
     blur_px = np.sqrt(view.blur2_px2 + filter_px2 + small**2 / 4)
     sizes = np.column_stack([view.streak_length_px, large]) / blur_px[:, None]
     keys = np.rint(SHAPES * np.log1p(sizes)).astype(int)
-    for key in np.unique(keys, axis=0):
+    for key in set(map(tuple, keys.tolist())):
         rows = (keys == key).all(axis=1)
-        yield rows, blur_px[rows], image_shape(*key.tolist())
+        yield rows, blur_px[rows], image_shape(*key)
 
 
 @lru_cache(maxsize=256)

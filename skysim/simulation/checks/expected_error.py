@@ -15,7 +15,7 @@ Each cause is an e_i, so each has its own covariance of w:
 A known error is one of the second kind with p = 1. With G_i the derivative of x_i by the light's position in camera
 axes and R the rotation from lab to camera axes:
 
-    centroid noise : S_i of `centroid_variance`
+    centroid noise : S_i of `with_noise`
     LED survey     : S_i = sigma^2 G_i G_i'                  lever survey : E_i = -sigma G_i
     surface survey : E_i = sigma G_i R n_i, n_i the normal   focal length : E_i = relative error (x_i - center)
     common survey  : E_i = G_i dP_i + change by the lens, dP_i of LED i from the pupil; with it no lever, focal length
@@ -36,7 +36,6 @@ camera's position, so its J_i has three more columns. Errors of star places are 
 """
 
 import math
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -58,7 +57,7 @@ from skysim.camera.projection import lateral_color
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, lengths, normalized
 from skysim.scene.unused import differs
-from skysim.simulation.checks.detection import Context, centroid_variance, misshapen_px
+from skysim.simulation.checks.detection import Context, misshapen_px, with_noise
 from skysim.simulation.checks.views import View
 from skysim.simulation.lights.effects import AirEffects
 from skysim.simulation.lights.light import find_light
@@ -317,9 +316,8 @@ UNKNOWN_TO_TRACKER = (
 # A survey draws these once. The tracker's covariance contains them, its matching radius does not.
 OUTSIDE_OF_GATE = ("survey set-up", "common survey", "surface survey")
 CENTROIDS = "centroid noise"
-# Causes of errors that are independent in each light.
+# Causes of errors that are independent in each light, beside the noise of the centroids.
 INDEPENDENT = {
-    CENTROIDS: centroid_variance,
     "LED survey": led_survey,
     "response within pixels": pixel_response,
 }
@@ -371,32 +369,36 @@ def of_common(gain: Floats, displacement_px: Floats) -> Floats:
     return response @ response.T
 
 
-def believed_px2(view: View, context: Context, prnu: float | None = None) -> Floats:
+def believed_px2(view: View, context: Context, floor_px: float | None) -> Floats:
     """(n, 2, 2) covariance of each image position that the tracker believes: centroid, floor and LED survey.
 
-    A floor that is estimated from each frame is 0 here: nothing else disturbs the centroids.
     Only the fit of streaks tells the star tracker the directions of its errors.
+
+    Parameters
+    ----------
+    view, context
+        The n lights, and the data of the checks
+    floor_px
+        Least centroid error; None if it is estimated from each frame, as nothing else disturbs the centroids
     """
     settings = context.settings
     beliefs = context.beliefs
-    own = centroid_variance(view, context, prnu)
+    noise_px2 = view.noise_px2
     if context.surface is not None or settings.centroider not in ("default", "streak"):
-        own = np.trace(own, axis1=1, axis2=2)[:, None, None] / 2 * np.eye(2)
+        variance = np.trace(noise_px2, axis1=1, axis2=2) / 2
+        noise_px2 = variance[:, None, None] * np.eye(2)
     survey_px = np.zeros(len(view))
     if beliefs.dome:
         camera, leds, lever = beliefs.dome
         survey_px = camera.focal_px * led_sigma_rad(leds, lever)[view.row]
-    added_px2 = (settings.centroid_sigma_px or 0.0) ** 2 + survey_px**2
-    return own + added_px2[:, None, None] * np.eye(2)
+    added_px2 = (floor_px or 0.0) ** 2 + survey_px**2
+    return noise_px2 + added_px2[:, None, None] * np.eye(2)
 
 
 def believed_sigma_px(view: View, context: Context) -> Floats:
     """(n,) standard deviation of each image position in the tracker's gates: `believed_px2` with the search's floor."""
-    floor_px = context.settings.searched_sigma_px
-    searching = replace(
-        context, settings=replace(context.settings, centroid_sigma_px=floor_px)
-    )
-    return np.sqrt(np.trace(believed_px2(view, searching), axis1=1, axis2=2) / 2)
+    believed = believed_px2(view, context, context.settings.searched_sigma_px)
+    return np.sqrt(np.trace(believed, axis1=1, axis2=2) / 2)
 
 
 def within_gate(view: View, context: Context) -> View:
@@ -409,7 +411,8 @@ def within_gate(view: View, context: Context) -> View:
         return view
     off_px = lengths(error - np.median(error, axis=0))
     off_px *= context.camera.optics.camera.focal_px
-    return view.take(off_px <= GATE_SIGMA * believed_sigma_px(view, context))
+    sigma_px = believed_sigma_px(with_noise(view, context), context)
+    return view.take(off_px <= GATE_SIGMA * sigma_px)
 
 
 class Mismatch(NamedTuple):
@@ -467,8 +470,9 @@ def mismatch(view: View, context: Context) -> Mismatch | None:
     if not shifts:
         return None
     sigma_px = believed_sigma_px(view, context)
+    floor_px = context.settings.centroid_sigma_px
     try:
-        gain = gains(view, believed_px2(view, context))
+        gain = gains(view, believed_px2(view, context, floor_px))
     except np.linalg.LinAlgError:
         return None
     known = np.zeros((len(view), 2, 1))
@@ -513,7 +517,7 @@ def solver_error(view: View, context: Context) -> Floats | None:
 
 def expected(views: list[View], context: Context) -> Expected:
     """The expected errors at some attitudes, from the views of the lights that the tracker uses there."""
-    names = (*INDEPENDENT, *CAUSES, SOLVER)
+    names = (CENTROIDS, *INDEPENDENT, *CAUSES, SOLVER)
     found = [causes_at(view, context) for view in views]
     by_cause = {
         name: np.array([one.get(name, np.zeros(3)) for one in found]).T for name in names
@@ -524,6 +528,7 @@ def expected(views: list[View], context: Context) -> Expected:
 
 def causes_at(view: View, context: Context) -> dict[str, Floats]:
     """(3,) variances about the camera's axes at one attitude in rad^2, by cause; NaN with too few lights."""
+    floor_px = context.settings.centroid_sigma_px
     # 1. Gains, with the parameters that the tracker fits as well.
     fitted = None
     if fits_focal_length(context):
@@ -533,11 +538,11 @@ def causes_at(view: View, context: Context) -> dict[str, Floats]:
     try:
         if len(view) < MIN_EVIDENCE_MATCHES:
             raise np.linalg.LinAlgError("too few lights")
-        gain = gains(view, believed_px2(view, context), fitted)
+        gain = gains(view, believed_px2(view, context, floor_px), fitted)
     except np.linalg.LinAlgError:
         return {CENTROIDS: np.full(3, np.nan)}
     # 2. and 3. Covariances by each cause, and the solver's own error squared.
-    variances = {}
+    variances = {CENTROIDS: np.diag(of_independent(gain, view.noise_px2))}
     for table, propagated in ((INDEPENDENT, of_independent), (CAUSES, of_common)):
         for name, cause in table.items():
             error_px = cause(view, context)

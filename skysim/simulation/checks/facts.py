@@ -16,7 +16,7 @@ from skysim.camera.psf.otf import blur_radius_px
 from skysim.core.constants import ARCSEC_RAD
 from skysim.core.types import Floats, Record, around_z, median, polar_rad
 from skysim.simulation.checks import attitudes, beliefs, vehicle_facts
-from skysim.simulation.checks.detection import Context, centroid_variance
+from skysim.simulation.checks.detection import Context
 from skysim.simulation.checks.expected_error import mean_root
 from skysim.simulation.checks.sampling import Plan, Sampled
 from skysim.simulation.checks.vehicle_facts import Fact, short
@@ -437,7 +437,7 @@ def expected_error(plan: Plan) -> Fact:
             "cross_arcsec": cross,
             "roll_arcsec": roll,
             "without_solution": failing,
-            "centroid_px": centroid_px(plan, sampled),
+            "centroid_px": centroid_px(sampled),
             "cross_causes_arcsec": causes(sampled, "cross"),
             "roll_causes_arcsec": causes(sampled, "roll"),
         }
@@ -465,13 +465,12 @@ def expected_error(plan: Plan) -> Fact:
     return Fact("expected error", lines, values)
 
 
-def centroid_px(context: Context, sampled: Sampled) -> float:
+def centroid_px(sampled: Sampled) -> float:
     """Rms noise of the centroids along each axis at some attitudes; NaN without lights."""
-    variances = [centroid_variance(view, context) for view in sampled.used if len(view)]
-    if not variances:
+    noise_px2 = np.concatenate([view.noise_px2 for view in sampled.used])
+    if not len(noise_px2):
         return math.nan
-    traces = np.trace(np.concatenate(variances), axis1=1, axis2=2)
-    return math.sqrt(traces.mean() / 2)
+    return math.sqrt(np.trace(noise_px2, axis1=1, axis2=2).mean() / 2)
 
 
 def errors_text(cross: float, roll: float) -> str:

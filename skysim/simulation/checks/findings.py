@@ -18,14 +18,8 @@ from skysim.scene.scene import Scene
 from skysim.scene.sections.camera import TwoStopsConfig
 from skysim.scene.sections.layouts import Layout, OnPoints
 from skysim.simulation.checks import vehicle_facts
-from skysim.simulation.checks.detection import (
-    detected_area_px,
-    threshold_e,
-)
-from skysim.simulation.checks.expected_error import (
-    AS_BUILT,
-    mismatch,
-)
+from skysim.simulation.checks.detection import detected_px, threshold_e
+from skysim.simulation.checks.expected_error import AS_BUILT, mismatch
 from skysim.simulation.checks.facts import GAUSSIAN_WIDTH, cap_margin, fill, short, uneven_px
 from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.lights.emitters import BACKGROUND
@@ -248,7 +242,7 @@ def undetected(plan: Plan) -> str:
     explained = (bright_background, black_level, dark_corners, long_smear)
     if not seen or used >= MIN_DETECTED * seen or any(find(plan) for find in explained):
         return ""
-    area = np.concatenate([detected_area_px(view, plan) for view in plan.frames.seen])
+    area = np.concatenate([detected_px(view, plan)[1] for view in plan.frames.seen])
     text = f"the tracker detects {100 * used / seen:.0f} % of the lights in the field"
     if np.median(area) > 0.5:
         return (

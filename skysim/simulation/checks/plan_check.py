@@ -354,15 +354,16 @@ def compared(plan: Plan, least: float, most_work: int) -> tuple[Ambiguity, float
     # 1. Distance within which LEDs coincide, from the tracker's standard deviation of an image position.
     lab = plan.lab
     camera = plan.camera.optics.camera
-    sigma_px = [believed_sigma_px(view, plan) for view in plan.reach.used if len(view)]
-    distance_m = median(plan.reach.joined("distance_m"))
+    reach = plan.reach
+    sigma_px = [believed_sigma_px(view, plan) for view in reach.used]
+    distance_m = median(reach.joined("distance_m"))
     typical_px = median(np.concatenate(sigma_px))
     coincidence_m = SIGMAS * typical_px * distance_m / camera.focal_px
     # 2. Greatest tilt of the fields, reduced to what most_work allows.
     place_m = plan.beliefs.lights.xyz
-    most = int(most_work / np.mean([len(view) for view in plan.reach.seen]))
+    most = int(most_work / np.mean([len(view) for view in reach.seen]))
     zenith_rad = np.sort(polar_rad(place_m))
-    tilt_rad = math.radians(plan.reach.attitudes.tilts_deg.max())
+    tilt_rad = math.radians(reach.attitudes.tilts_deg.max())
     if len(zenith_rad) >= most:
         tilt_rad = min(tilt_rad, float(zenith_rad[most - 1]))
     # 3. Comparison, with circular fields of the detector's area.

@@ -7,15 +7,25 @@ only add light unknown to the tracker are left out.
 import math
 from collections import Counter
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from estimator.identification.chance import MIN_EVIDENCE_MATCHES
-from skysim.core.types import Bools, Floats
+from skysim.core.types import Bools, Floats, median
 from skysim.simulation.checks.attitudes import CheckedAttitudes
-from skysim.simulation.checks.detection import Context, broken, usable
-from skysim.simulation.checks.expected_error import Expected, expected, within_gate
+from skysim.simulation.checks.detection import Context, broken, usable, with_noise
+from skysim.simulation.checks.expected_error import (
+    Expected,
+    believed_px2,
+    expected,
+    gains,
+    of_common,
+    of_independent,
+    star_places,
+    within_gate,
+)
 from skysim.simulation.checks.views import View, view
 from skysim.simulation.exposure import expected_exposure
 from skysim.simulation.lights.light import Beam, Exposure, beam_of
@@ -35,7 +45,7 @@ class Sampled(NamedTuple):
     seen
         Those of `known` that are not hidden
     used
-        Those of `seen` that the tracker detects and uses
+        Those of `seen` that the tracker detects and uses, with the noise of their centroids
     others
         Lights that the tracker detects and does not know, by name
     error
@@ -84,6 +94,43 @@ class Plan(Context):
     frames: Sampled
     reach: Sampled
 
+    @cached_property
+    def claimed_nees(self) -> float:
+        """The expected NEES over the whole sky with the tracker's least centroid error; NaN without one."""
+        floor_px = self.settings.centroid_sigma_px
+        if not self.scene.stars or floor_px is None:
+            return math.nan
+        return self.expected_nees(floor_px)
+
+    def expected_nees(self, floor_px: float) -> float:
+        """Median of the expected NEES over the attitudes in reach; NaN without lights, or if most streaks break.
+
+        The tracker claims the covariance M^-1, the inverse Fisher information for the covariances C_i that it
+        believes: those of photon and read-out noise, and the least centroid error floor_px, which is
+        `tracker.centroid_sigma_px`, in quadrature. The errors of the centroids have a covariance C of noise, the
+        pixels' sensitivity and star places. The mean of the NEES, e' M e, is trace(M C): 3 if the claim is true.
+        """
+        reach = self.reach
+        if not reach.predicted():
+            return math.nan
+        found = []
+        for lights in reach.used:
+            if len(lights) <= 2:
+                continue
+            believed = believed_px2(with_noise(lights, self, prnu=0.0), self, floor_px)
+            try:
+                gain = gains(lights, believed)
+            except np.linalg.LinAlgError:
+                continue
+            # C, then M.
+            places = star_places(lights, self)
+            errors = of_independent(gain, lights.noise_px2)
+            errors = errors if places is None else errors + of_common(gain, places)
+            weighted = np.linalg.solve(believed, lights.jacobian)
+            information = np.einsum("nij,nik->jk", lights.jacobian, weighted)
+            found.append(float(np.trace(information @ errors)))
+        return median(found) if found else math.nan
+
 
 def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
     """The views at some attitudes, and the expected errors there."""
@@ -103,7 +150,7 @@ def sampled(at: CheckedAttitudes, context: Context) -> Sampled:
         seen = known.take(known.visible)
         # 3. Detected lights, and those of a solution with them.
         detected = usable(known.take(known.visible & ~breaks), context)
-        used = within_gate(detected, context)
+        used = with_noise(within_gate(detected, context), context)
         # Those that are left where most streaks break are not fitted as well as expected.
         most_break = breaks.any() and 2 * len(detected) < len(usable(seen, context))
         fits.append(used.take(used.row < 0) if most_break else used)

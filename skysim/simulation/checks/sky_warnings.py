@@ -2,31 +2,22 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from skysim.camera.glow.background import angular_separation_deg
 from skysim.core.constants import ARCSEC_RAD
-from skysim.core.types import Floats, median
+from skysim.core.types import Floats
 from skysim.scene.sections.camera import CameraConfig
 from skysim.simulation.checks.detection import (
     BINOMIAL_VARIANCE_PX2,
     STILL_PX,
     Context,
-    centroid_variance,
     threshold_e,
-)
-from skysim.simulation.checks.expected_error import (
-    believed_px2,
-    gains,
-    of_common,
-    of_independent,
-    star_places,
 )
 from skysim.simulation.checks.facts import Fact, short
 from skysim.simulation.checks.findings import few_lights
-from skysim.simulation.checks.sampling import Plan, Sampled
+from skysim.simulation.checks.sampling import Plan
 from skysim.simulation.checks.views import peak_share
 from skysim.simulation.lights.effects import STRAY_LIGHT, AirEffects, stray_e_s
 from skysim.simulation.lights.light import find_light
@@ -143,48 +134,9 @@ TRUE_NEES = 3.0
 LARGEST_FLOOR_PX = 1.0
 
 
-def expected_nees(sampled: Sampled, context: Context, floor_px: float) -> float:
-    """Median of the expected NEES over some attitudes; NaN without lights, or if most streaks break.
-
-    The tracker claims the covariance M^-1, the inverse Fisher information for the covariances C_i that it
-    believes: those of photon and read-out noise, and the least centroid error floor_px (`tracker.centroid_sigma_px`)
-    in quadrature. The errors of the centroids have a covariance C of noise, the pixels' sensitivity and star places.
-    The mean of the NEES, e' M e, is trace(M C): 3 if the claim is true.
-    """
-    found = []
-    settings = replace(context.settings, centroid_sigma_px=floor_px)
-    claiming = replace(context, settings=settings)
-    if not sampled.predicted():
-        return math.nan
-    for view in sampled.used:
-        if len(view) <= 2:
-            continue
-        believed = believed_px2(view, claiming, prnu=0.0)
-        try:
-            gain = gains(view, believed)
-        except np.linalg.LinAlgError:
-            continue
-        # C, then M.
-        places = star_places(view, context)
-        errors = of_independent(gain, centroid_variance(view, context))
-        errors = errors if places is None else errors + of_common(gain, places)
-        weighted = np.linalg.solve(believed, view.jacobian)
-        information = np.einsum("nij,nik->jk", view.jacobian, weighted)
-        found.append(float(np.trace(information @ errors)))
-    return median(found) if found else math.nan
-
-
-def claimed(plan: Plan) -> float:
-    """The expected NEES over the whole sky with the tracker's least centroid error; NaN without one."""
-    floor_px = plan.settings.centroid_sigma_px
-    if not plan.scene.stars or floor_px is None:
-        return math.nan
-    return expected_nees(plan.reach, plan, floor_px)
-
-
 def fact(plan: Plan) -> Fact | None:
     """The fact about the expected NEES; None under other lights, and if the floor is estimated from each frame."""
-    nees = claimed(plan)
+    nees = plan.claimed_nees
     if math.isnan(nees):
         return None
     floor_px = plan.settings.searched_sigma_px
@@ -198,7 +150,7 @@ def floor_too_small(plan: Plan) -> str:
 
     The recommended value, at which the claim is true, is found by bisection.
     """
-    nees = claimed(plan)
+    nees = plan.claimed_nees
     factor = math.sqrt(nees / TRUE_NEES) if nees > 0 else 0.0
     if factor <= MAX_FACTOR:
         return ""
@@ -206,7 +158,7 @@ def floor_too_small(plan: Plan) -> str:
     high = LARGEST_FLOOR_PX
     while high / low > 1.02:
         middle = math.sqrt(low * high)
-        small = expected_nees(plan.reach, plan, middle) > TRUE_NEES
+        small = plan.expected_nees(middle) > TRUE_NEES
         low, high = (middle, high) if small else (low, middle)
     return (
         f"tracker.centroid_sigma_px: the tracker will claim errors that are {factor:.2g} times too small (NEES"

@@ -46,10 +46,10 @@ class View(NamedTuple):
         (n, 2) image positions
     offset_m
         (n, 3) vectors from the pupil to the lights in camera axes; unit vectors for stars
-    arm_m
-        (n, 3) vectors from the bearing to the lights in camera axes; equal to offset_m for stars
     gradient
         (n, 2, 3) derivatives of xy_px by offset_m
+    jacobian
+        (n, 2, 3) derivatives J_i of xy_px by a small rotation w of the lights about the bearing, in camera axes
     distance_m
         (n,) distances along the boresight; infinite for stars
     electrons
@@ -64,6 +64,8 @@ class View(NamedTuple):
         (n,) mean electrons in the brightest pixel, background included
     behind
         (n,) names of the occluders that hide the lights; VISIBLE for none
+    noise_px2
+        (n, 2, 2) covariances of the centroids, see `detection.with_noise`; zeros before
     """
 
     time: datetime.datetime
@@ -71,8 +73,8 @@ class View(NamedTuple):
     row: Ints
     xy_px: Floats
     offset_m: Floats
-    arm_m: Floats
     gradient: Floats
+    jacobian: Floats
     distance_m: Floats
     electrons: Floats
     disk_px: Floats
@@ -81,6 +83,7 @@ class View(NamedTuple):
     streak_px: Floats
     peak_e: Floats
     behind: Array
+    noise_px2: Floats
 
     def __len__(self) -> int:
         return len(self.row)
@@ -89,14 +92,6 @@ class View(NamedTuple):
     def visible(self) -> Bools:
         """(n,) whether nothing hides the lights."""
         return self.behind == VISIBLE
-
-    @property
-    def jacobian(self) -> Floats:
-        """(n, 2, 3) derivatives J_i of xy_px by a small rotation w of the lights about the bearing, in camera axes.
-
-        d(offset) = w x arm, so a row of the gradient g gives g . (w x arm) = w . (arm x g).
-        """
-        return np.cross(self.arm_m[:, None, :], self.gradient)
 
     @property
     def streak_length_px(self) -> Floats:
@@ -215,7 +210,9 @@ def view(
     arm_m = exposure.cam_from_lab.apply(chosen.xyz)
     offset_m = arm_m - chosen.place[:, 3:] * mount.cam_from_body.apply(mount.camera_body_m)
     gradient = image_gradient(optics, offset_m)
-    streak_px = paths_px(exposure, camera.exposure_s, chosen.motion, arm_m, gradient)
+    # d(offset) = w x arm, so a row of the gradient g gives g . (w x arm) = w . (arm x g).
+    jacobian = np.cross(arm_m[:, None, :], gradient)
+    streak_px = paths_px(exposure, camera.exposure_s, chosen.motion, gradient, jacobian)
     # 4. What hides them: of several occluders, the last.
     behind = np.full(len(row), VISIBLE, object)
     for occluder in occluders:
@@ -232,8 +229,8 @@ def view(
         row,
         xy_px,
         offset_m,
-        arm_m,
         gradient,
+        jacobian,
         depth_m,
         electrons,
         disk_px,
@@ -242,6 +239,7 @@ def view(
         streak_px,
         electrons * share + camera.background_e,
         behind,
+        np.zeros((len(row), 2, 2)),
     )
 
 
@@ -249,11 +247,10 @@ def paths_px(
     exposure: Exposure,
     exposure_s: float,
     motion: Floats | None,
-    arm_m: Floats,
     gradient: Floats,
+    jacobian: Floats,
 ) -> Floats:
     """(n, 2) paths during the exposure, by minus the rate of the vehicle; moving lights add their `motion`."""
-    jacobian = np.cross(arm_m[:, None, :], gradient)
     cam_from_body = exposure.mount.cam_from_body
     rate_cam = cam_from_body.apply(exposure.trajectory.rate_at(exposure.t_s))
     streak_px = -exposure_s * np.einsum("nij,j->ni", jacobian, rate_cam)
