@@ -278,7 +278,13 @@ def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
         cell = row * CELLS + column
         rank[n] = used[cell]
         used[cell] += 1
-    return np.sort(np.argsort(rank, kind="mergesort")[:count])
+    kept = np.zeros(len(places), np.bool_)
+    for turn in range(count):
+        for n in range(len(places)):
+            if rank[n] == turn and count:
+                kept[n] = True
+                count -= 1
+    return np.flatnonzero(kept)
 
 
 @jit

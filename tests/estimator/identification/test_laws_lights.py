@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as some
 
 from estimator.core.types import Centroids
-from estimator.identification.star_detections import lights_of
+from estimator.identification.star_detections import CELLS, lights_of, spread
 from tests.helpers.laws import SEEDS, law
 
 
@@ -48,3 +48,21 @@ def test_pairs_of_some_stars_and_of_chance_stay_apart() -> None:
         whole = lights_of(seen, size, size, count)
         assert whole.centroids is seen
         assert whole.rows is None
+
+
+def test_each_part_of_the_field_gives_its_brightest_before_any_gives_more() -> None:
+    """Against a stable sort by the number of brighter lights in the same cell."""
+    rng = np.random.default_rng(56)
+    field = np.array([-1.0, 1.0, -2.0, 2.0])
+    for total in (3, 16, 60):
+        # A third is a clump.
+        places = rng.uniform(field[::2], field[1::2], (total, 2))
+        places[::3] = 0.3 + rng.normal(0, 0.01, places[::3].shape)
+        column, row = (CELLS * (places - field[::2]) / (field[1::2] - field[::2])).T.astype(
+            int
+        )
+        cell = CELLS * row + column
+        rank = [np.sum(cell[:n] == cell[n]) for n in range(total)]
+        for count in (1, 10, 40):
+            expected = np.sort(np.argsort(rank, kind="stable")[:count])
+            np.testing.assert_array_equal(spread(places, field, count), expected)
