@@ -47,6 +47,7 @@ from estimator.identification.chance import (
 )
 from estimator.identification.refusals import AMBIGUOUS
 from estimator.identification.star_detections import (
+    Detections,
     FlatCentroids,
     Sensor,
     chosen,
@@ -120,7 +121,12 @@ def with_rivals(
                 zero_point_mag=float(np.mean(zero_mag)),
                 magnitude_sigma=hypot(MAGNITUDE_SIGMA, np.std(zero_mag)),
             )
-            found = _find(lights, view, sky, rest, quads)
+            unmatched = _unmatched(lights, view, rest)
+            if quads is None:
+                found = star_search.lost_in_space(unmatched, sky, MOST_LIGHTS, MAX_CHECKS)
+            else:
+                effort = MOST_LIGHTS, QUAD_CHECKS
+                found = star_quads.identify(unmatched, quads, sky, *effort, False)
             if len(found.star):
                 break
         if not len(found.star):
@@ -175,18 +181,6 @@ def _is_comparable(matches: int, fewer: int, share: float) -> bool:
 
 
 @jit
-def _find(
-    lights: FlatCentroids,
-    sensor: Sensor,
-    sky: SkyIndex,
-    rest: NDArray,
-    quads: QuadIndex | None,
-) -> Solution:
-    """Search some rows of the lights for a second sky: step 2 of the module; one call of compiled code is faster."""
-    # Not as constants, for which numba would compile the whole search once more.
-    most = np.int64(MOST_LIGHTS)
-    detections = chosen(detections_of(lights, sensor, 0.0), rest)
-    if quads is None:
-        return star_search.lost_in_space(detections, sky, most, np.int64(MAX_CHECKS))
-    checks = np.int64(QUAD_CHECKS)
-    return star_quads.identify(detections, quads, sky, most, checks, np.bool_(False))
+def _unmatched(lights: FlatCentroids, sensor: Sensor, rest: NDArray) -> Detections:
+    """Some rows of the lights. They are searched as a frame's lights are, so the search is compiled once."""
+    return chosen(detections_of(lights, sensor, 0.0), rest)
