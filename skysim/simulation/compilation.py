@@ -52,6 +52,8 @@ class TrackerCompilation(event.Listener):
             self.process = subprocess.Popen(
                 self.command, stdin=silent, stdout=silent, stderr=silent
             )
+            # The collector would go through all that is imported again and again.
+            gc.freeze()
         elif self.process is not None and module.startswith("estimator."):
             self.process.wait()
 
