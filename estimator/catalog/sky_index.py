@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from estimator.core.checks import Floats, Ints, Ints32
+from estimator.core.checks import Floats, Ints32
 from estimator.core.errors import ImageError
 from estimator.core.jit import jit
 from estimator.core.vectors import lengths, row, squared_chord
@@ -58,9 +58,9 @@ def build_grid(vectors: Floats, per_cell: float = STARS_PER_CELL) -> Cells:
 
 
 @jit
-def _cube_cells(vectors: Floats, side: int) -> Ints:
+def _cube_cells(vectors: Floats, side: int) -> Ints32:
     """(N,) number of the cell of each unit vector (N, 3); cells adjacent in z have successive numbers."""
-    cell = np.empty(len(vectors), np.int64)
+    cell = np.empty(len(vectors), np.int32)
     for n in range(len(vectors)):
         x, y, z = vectors[n]
         cell[n] = (edge_cell(x, side) * side + edge_cell(y, side)) * side + edge_cell(z, side)

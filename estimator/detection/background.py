@@ -111,9 +111,13 @@ def cleaned(
 @jit
 def is_steep(level: Floats, noise: Floats) -> bool:
     """Return whether the level changes by more than the noise from one tile to the next in a part of the frame."""
-    corner = level[1:, 1:]
-    change = np.abs(corner - level[:-1, 1:]) + np.abs(corner - level[1:, :-1])
-    return bool(np.count_nonzero(change > noise[1:, 1:]) > STEEP * change.size)
+    height, width = level.shape
+    steep = 0
+    for y in range(1, height):
+        for x in range(1, width):
+            rise = abs(level[y, x] - level[y - 1, x]) + abs(level[y, x] - level[y, x - 1])
+            steep += rise > noise[y, x]
+    return steep > STEEP * (height - 1) * (width - 1)
 
 
 def flattened(image: NDArray, saturation: float) -> NDArray:

@@ -118,3 +118,16 @@ def test_a_frame_of_texture_is_refused() -> None:
 def test_searches_use_the_given_floor_or_the_usual_one(sigma_px: float | None) -> None:
     found = Settings(centroid_sigma_px=sigma_px).searched_sigma_px
     assert found == (0.1 if sigma_px is None else sigma_px)
+
+
+@law(background.is_steep)
+@given(rng=SEEDS, height=some.integers(1, 6), width=some.integers(1, 6))
+def test_a_sky_is_steep_if_many_steps_exceed_the_noise(
+    rng: np.random.Generator, height: int, width: int
+) -> None:
+    """Steps down and to the right of each tile, by NumPy's differences."""
+    level = rng.normal(size=(height, width))
+    noise = np.full(level.shape, rng.uniform(0.5, 5))
+    step = np.abs(np.diff(level, axis=0)[:, 1:]) + np.abs(np.diff(level, axis=1)[1:])
+    steep = np.sum(step > noise[1:, 1:]) > background.STEEP * step.size
+    assert background.is_steep(level, noise) == steep
