@@ -512,6 +512,20 @@ def test_a_longer_lens_has_a_smaller_field(fov_rad: float, factor: float) -> Non
     )
 
 
+@law(Camera.field_sr)
+@given(fov_deg=some.floats(0.5, 8), aspect=some.floats(0.3, 1))
+def test_a_small_field_has_the_solid_angle_of_its_pyramid(
+    fov_deg: float, aspect: float
+) -> None:
+    """Omega = 4 asin(sin(a / 2) sin(b / 2)) of a pyramid with the angles a and b between opposite sides."""
+    lens = Camera.from_fov(2000, round(2000 * aspect), np.radians(fov_deg))
+    sides_rad = 2 * np.arctan(np.array([lens.width_px, lens.height_px]) / 2 / lens.focal_px)
+    exact_sr = 4 * np.arcsin(np.prod(np.sin(sides_rad / 2)))
+    # A pixel's solid angle falls by cos^3 of its angle from the axis: by 1.5 tan^2 on the mean, to second order.
+    second = 1.5 * np.sum(np.tan(sides_rad / 2) ** 2) / 3
+    assert lens.field_sr == pytest.approx(exact_sr * (1 + second), rel=2 * second**2)
+
+
 # Attitude
 
 
