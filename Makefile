@@ -7,7 +7,7 @@ LOCK ?=
 PIP = $(BIN)/pip install --quiet --disable-pip-version-check $(if $(LOCK),-c $(LOCK))
 LOWEST := out/lowest
 
-# Extras, e.g. dev+catalog: by uv, in a fifth of pip's time, or by pip, which also reads an index from pip.conf.
+# Extras, e.g. dev+catalog: by uv, in a fifth of pip's time, or else by pip. uv has its own setting of an index, UV_DEFAULT_INDEX.
 comma := ,
 editable = -e '.[$(subst +,$(comma),$(1))]'
 install = $(BIN)/uv pip install --quiet --python $(BIN)/python $(if $(LOCK),-c $(LOCK)) $(editable) || $(PIP) $(editable)
@@ -15,7 +15,7 @@ install = $(BIN)/uv pip install --quiet --python $(BIN)/python $(if $(LOCK),-c $
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "skysim needs Python 3.11 or newer")'
 	$(PYTHON) -m venv .venv
-	$(PIP) uv
+	-$(PIP) uv
 	$(call install,dev+catalog)
 	touch $@
 

@@ -515,11 +515,14 @@ def close_groups(points: Floats, distance: float) -> Ints:
 
 
 def brighter_than(stars: StarCatalog, limit_mag: float) -> StarCatalog:
-    """Select the stars down to a limiting V magnitude: the first ones, without a copy."""
+    """Select the stars down to a limiting V magnitude: the first ones of a catalog, brightest first; not copied."""
     return stars.take(slice(np.searchsorted(stars.v_mag, limit_mag, "right")))
 
 
 def limit_for_density(stars: StarCatalog, field_sr: float, mean_count: float) -> float:
-    """The limiting magnitude at which a field of `field_sr` steradians holds `mean_count` stars on average."""
+    """The limiting magnitude at which a field of `field_sr` steradians holds `mean_count` stars on average.
+
+    The stars are brightest first.
+    """
     count = int(np.clip(mean_count * 4 * np.pi / field_sr, 1, len(stars)))
     return float(stars.v_mag[count - 1])

@@ -30,7 +30,7 @@ FORM = b"quads 1"
 FEW_STARS = 50_000
 MOST_FILES = 8
 HEAD = SIDE**4 + 1  # words of `first`
-MAPPED: list[ref[mmap.mmap]] = []
+MAPPED: list[ref[mmap.mmap]] = []  # maps of the files, those that are gone too
 WHOLE_CRC = 0x2144DF1C  # CRC-32 of any bytes followed by their CRC-32, the low byte first
 
 
@@ -70,7 +70,8 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
 def release() -> None:
     """Give the pages of all mapped files back. They count as memory, and are mapped again where they are read."""
     for mapped in MAPPED:
-        if pages := mapped():
+        pages = mapped()
+        if pages and hasattr(pages, "madvise"):  # not on all systems
             pages.madvise(mmap.MADV_DONTNEED)
 
 

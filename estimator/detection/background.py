@@ -115,8 +115,8 @@ def is_steep(level: Floats, noise: Floats) -> bool:
     steep = 0
     for y in range(1, height):
         for x in range(1, width):
-            rise = abs(level[y, x] - level[y - 1, x]) + abs(level[y, x] - level[y, x - 1])
-            steep += rise > noise[y, x]
+            change = abs(level[y, x] - level[y - 1, x]) + abs(level[y, x] - level[y, x - 1])
+            steep += change > noise[y, x]
     return steep > STEEP * (height - 1) * (width - 1)
 
 

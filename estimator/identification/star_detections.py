@@ -279,11 +279,14 @@ def spread(places: Floats, field: Floats, count: int) -> NDArray[np.int64]:
         rank[n] = used[cell]
         used[cell] += 1
     kept = np.zeros(len(places), np.bool_)
-    for turn in range(count):
+    turn = 0
+    left = min(count, len(places))
+    while left:
         for n in range(len(places)):
-            if rank[n] == turn and count:
+            if rank[n] == turn and left:
                 kept[n] = True
-                count -= 1
+                left -= 1
+        turn += 1
     return np.flatnonzero(kept)
 
 

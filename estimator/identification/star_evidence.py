@@ -167,11 +167,8 @@ def evaluate(
             if dex + counts_dex(len(observed), 0) < min_dex:
                 return no_hypothesis()
         # A fit that has converged on the same matches need not be repeated.
-        if (
-            fall < least_squares.CONVERGED_CHI2
-            and np.array_equal(observed, before[0])
-            and np.array_equal(star, before[1])
-        ):
+        same = fall < least_squares.CONVERGED_CHI2 and np.array_equal(observed, before[0])
+        if same and np.array_equal(star, before[1]):
             break
         # 2. and 4. Fit; the interval of the focal ratio has a margin, as the fit is noisy.
         if n < 2:
@@ -327,13 +324,11 @@ def _fit(
     d_x = np.zeros(4)
     d_y = np.zeros(4)
     tangent = detections.tangent
-    weight = detections.weight
-    vectors_ref = sky.vectors
     for k in range(len(observed)):
-        x, y = project(vectors_ref, R, star[k])
+        x, y = project(sky.vectors, R, star[k])
         slopes(x, y, f, d_x, d_y)
         # Weighted sums of the derivatives; the matrix is symmetric, so that its lower triangle suffices.
-        xx, yy, xy = vectors.row(weight, observed[k])
+        xx, yy, xy = vectors.row(detections.weight, observed[k])
         residual_x = tangent[observed[k], 0] - f * x
         residual_y = tangent[observed[k], 1] - f * y
         for i in range(count):

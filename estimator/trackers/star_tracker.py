@@ -143,9 +143,6 @@ class StarTracker(FrameTracker):
         self.stars = catalog.merge_doubles(
             replace(stars, vectors=vectors), settings.merge_px / camera.focal_px
         )
-        self.lights = Lights(self.stars.vectors, np.zeros(3), self.with_errors)
-        mean_stars = len(self.stars) * camera.field_sr / (4 * np.pi)
-        self.most_lights = max(MIN_LIGHTS, round(LIGHTS_PER_STAR * mean_stars))
         paired = int(min(settings.field_stars * 4 * np.pi / camera.field_sr, len(self.stars)))
         # Of so many stars not all pairs are indexed, and a separation has hundreds of candidates.
         self.deep = paired >= index_file.FEW_STARS
@@ -159,7 +156,7 @@ class StarTracker(FrameTracker):
             longest_rad = quad_index.LONGEST * self._height_rad
         self.index: pair_index.PairIndex | None = None
         self.sky = sky_index.build(self.stars.vectors, self.stars.v_mag)
-        self._pairs = longest_rad, paired
+        self._pair_limits = longest_rad, paired
         bright = self.sky.vectors[:paired]
         if not default:
             unknown = settings.zero_point_mag is None
@@ -171,6 +168,12 @@ class StarTracker(FrameTracker):
         else:
             patterns = len(self._paired_sky().pair)
         self.field_matcher = FieldMatcher(camera, self.stars, focal_uncertainty, patterns)
+
+    @functools.cached_property
+    def most_lights(self) -> int:
+        """Greatest number of lights of a frame that are searched."""
+        mean_stars = len(self.stars) * self.camera.field_sr / (4 * np.pi)
+        return max(MIN_LIGHTS, round(LIGHTS_PER_STAR * mean_stars))
 
     @functools.cached_property
     def sensor(self) -> Sensor:
@@ -191,6 +194,7 @@ class StarTracker(FrameTracker):
 
     @functools.cached_property
     def _known(self) -> misfit.Known:
+        """What compiled code knows of the camera and the sky, with its pairs."""
         return tuple(self.sensor), tuple(self._paired_sky())
 
     @functools.cached_property
@@ -202,7 +206,7 @@ class StarTracker(FrameTracker):
         """Return the index of stars with its pairs, which are added to that of a deep sky on first use."""
         if not self.sky.pair.size:
             index_file.release()  # makes room for them
-            self.sky = sky_index.add_pairs(self.sky, *self._pairs)
+            self.sky = sky_index.add_pairs(self.sky, *self._pair_limits)
         return self.sky
 
     @property
@@ -339,9 +343,12 @@ class StarTracker(FrameTracker):
                 True,
             )
         once = functools.partial(self._solve_global, clock=clock or Clock(), effort=effort)
-        return solve_lights(self.camera, self.lights, centroids, once, rate, exposure_s)
+        lights = Lights(
+            self.stars.vectors, np.zeros(3), lambda seen, _: self.with_errors(seen)
+        )
+        return solve_lights(self.camera, lights, centroids, once, rate, exposure_s)
 
-    def with_errors(self, centroids: Centroids, _: object = None) -> Centroids:
+    def with_errors(self, centroids: Centroids) -> Centroids:
         """Return the centroids with their total errors as covariances."""
         sigma_px = self.sigma_px(centroids)
         excess_px2 = (sigma_px**2 - centroids.sigma_px**2)[:, None, None] * np.eye(2)

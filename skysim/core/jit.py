@@ -18,8 +18,8 @@ from skysim.core import errors
 jit = partial(
     numba.njit, cache=True, error_model="numpy", fastmath=False, no_cfunc_wrapper=True
 )
-# For functions that make no array and return none: their arrays' references are not counted. Each count is locked, and
-# waits until all numbers before it are in memory.
+# For functions that make no array and return none: references to their arrays are not counted. Each change of such a
+# count is a locked instruction, which waits for all stores before it. The option is private to numba.
 loop = partial(jit, _nrt=False)
 
 

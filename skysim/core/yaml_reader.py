@@ -515,9 +515,10 @@ def key_lines(text: str) -> dict[tuple[str, ...], int]:
         if isinstance(node, yaml.SequenceNode):
             inner = [(str(n), item, item) for n, item in enumerate(node.value)]
         for name, place, value in inner:
-            # A key with dots, which is unknown, is found by its components.
-            lines[(*keys, *name.split("."))] = place.start_mark.line + 1
-            visit(value, (*keys, name))
+            # A key with dots is found by its components.
+            inside = (*keys, *name.split("."))
+            lines[inside] = place.start_mark.line + 1
+            visit(value, inside)
 
     visit(yaml.compose(text, yaml.SafeLoader), ())
     return lines

@@ -177,7 +177,9 @@ def pid_torque(
     # 3. Euler's equation, with the gyroscopic torque of the body and of the stored momentum.
     acceleration = apply(body_from_ref, accel_ref) - feedback - kd * rate_error
     gyroscopic = cross(rate, matrix_vector(inertia, rate) + momentum)
-    torque[:] = matrix_vector(inertia, acceleration) + gyroscopic
+    wanted = matrix_vector(inertia, acceleration) + gyroscopic
+    for n in range(3):
+        torque[n] = wanted[n]
     return limited
 
 

@@ -123,11 +123,12 @@ def rotated_state(
 
     lab_from_ref = lab_from_start exp(angle axis),    rate = angle' axis,    acceleration = angle'' axis
     """
-    lab_from_ref_wxyz[:] = quaternion.multiply(
-        lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis)
-    )
-    rate[:] = rate_rad_s * axis
-    acceleration[:] = acceleration_rad_s2 * axis
+    wxyz = quaternion.multiply(lab_from_start_wxyz, quaternion.from_rotvec(angle_rad * axis))
+    for n in range(4):
+        lab_from_ref_wxyz[n] = wxyz[n]
+    for n in range(3):
+        rate[n] = rate_rad_s * axis[n]
+        acceleration[n] = acceleration_rad_s2 * axis[n]
 
 
 # Kinds of legs.

@@ -56,6 +56,7 @@ class TrackerCompilation(event.Listener):
             gc.freeze()
         elif self.process is not None and module.startswith("estimator."):
             self.process.wait()
+            gc.unfreeze()
 
     def on_end(self, _: event.Event) -> None:
         """Required by the interface; does nothing."""

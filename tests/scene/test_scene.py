@@ -15,6 +15,7 @@ from pydantic import BeforeValidator, TypeAdapter, ValidationError
 from skysim.camera.glow.background import BACKGROUNDS
 from skysim.camera.optics import VIGNETTING
 from skysim.camera.psf.otf import PSFS
+from skysim.core import yaml_reader
 from skysim.core.errors import InputError
 from skysim.core.paths import SCENES
 from skysim.core.units import SI_SUFFIX, ConfigModel, ErrorSchema, ToleranceConfig
@@ -1278,3 +1279,9 @@ def test_a_duplicate_key_is_refused(tmp_path):
     path.write_text((SCENES / "shefex2.yaml").read_text() + "\nseed: 3\n")
     with pytest.raises(InputError, match=r"^seed: duplicate key \(.*twice.yaml, line \d+\)$"):
         loader.load(path)
+
+
+def test_items_below_a_key_with_dots_have_their_own_lines() -> None:
+    text = "factors:\n  camera.f_number:\n    - 1\n    - 2\n  seed: {low: 1,\n    high: 2}\n"
+    assert yaml_reader.line_of(text, ["factors", "camera", "f_number", "1"]) == (4, 4)
+    assert yaml_reader.line_of(text, ["factors", "seed", "high"]) == (3, 6)

@@ -210,10 +210,10 @@ class Solver:
         if key not in self.tracker_cache:
             self.tracker_cache.clear()  # keep the trackers of one image size and date only
         cached = self.tracker_cache.setdefault(key, {})
-        for camera in self.candidate_cameras(width_px, height_px):
-            if camera not in cached:
-                cached[camera] = self.tracker(*camera)
-            yield cached[camera]
+        for lens in self.candidate_cameras(width_px, height_px):
+            if lens not in cached:
+                cached[lens] = self.tracker(*lens)
+            yield cached[lens]
 
     def tracker(self, camera: Camera, uncertainty: float) -> StarTracker:
         """A tracker with the brightest stars of the catalog, as many as its narrowest field needs.

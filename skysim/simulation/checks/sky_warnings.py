@@ -326,7 +326,7 @@ def detection_limit_mag(plan: Plan) -> float:
     """V of a star of the Sun's color that is detected in about half of the cases, at the slowest frame.
 
     An image of deviation s on a path L has the least area A = pi r^2 + 2 r L above the threshold T if its peak is
-    T exp(r^2 / (2 s^2)), see `detection.detected_area_px`.
+    T exp(r^2 / (2 s^2)), see `detection.detected_px`.
     """
     camera = plan.camera
     streak_px = least_streak_px(plan)

@@ -184,18 +184,13 @@ def view(
     camera: CameraModel,
     occluders: Sequence[Occluder],
 ) -> View:
-    """The points of a light on the detector in an exposure, hidden ones included.
+    """The points of a light on the detector in an exposure; `behind` names the occluders that hide some of them.
 
     1. Select the points on the detector.
     2. Electrons, from rate and on-time.
     3. Vectors to the lights, derivatives of the images, paths.
     4. Occluders.
     5. Sizes of lens image, LED disk and defocus disk.
-
-    Parameters
-    ----------
-    occluders
-        Occluders of the points; their names are in `behind`
     """
     # 1. Points on the detector.
     assert lit.points is not None

@@ -47,13 +47,14 @@ def covariances(rng: np.random.Generator, size: int, count: int = COUNT) -> Floa
 @given(rng=SEEDS)
 def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -> None:
     bearing, pupil = places(rng)
+    # The second order is 3e-11 for a step of four deviations.
     step_m = rng.normal(0, 1e-6, pupil.shape)
     turned_rad = rng.normal(0, 1e-6, 3)
     view = systematic.geometry(bearing, pupil)
     assert_allclose(view.tangent, tangents(pupil), rtol=0, atol=1e-15)
     gradient = rotation_fit.tangent_gradients(pupil)
     moved = tangents(pupil + step_m) - view.tangent
-    assert_allclose(np.einsum("kij,kj->ki", gradient, step_m), moved, rtol=0, atol=1e-11)
+    assert_allclose(np.einsum("kij,kj->ki", gradient, step_m), moved, rtol=0, atol=1e-10)
     # Along the ray nothing changes.
     assert_allclose(np.einsum("kij,kj->ki", gradient, pupil), 0, rtol=0, atol=1e-14)
     jacobian = rotation_fit.tangent_jacobian(bearing, pupil)
@@ -61,7 +62,7 @@ def test_changes_of_tangents_match_their_derivatives(rng: np.random.Generator) -
         tangents(pupil + Rotation.from_rotvec(turned_rad).apply(bearing) - bearing)
         - view.tangent
     )
-    assert_allclose((jacobian @ turned_rad).reshape(-1, 2), rotated, rtol=0, atol=1e-11)
+    assert_allclose((jacobian @ turned_rad).reshape(-1, 2), rotated, rtol=0, atol=1e-10)
     assert_allclose(view.jacobian.reshape(-1, 3), jacobian, rtol=0, atol=0)
     assert_allclose(view.gradient, gradient, rtol=0, atol=0)
 

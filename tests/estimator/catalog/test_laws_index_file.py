@@ -51,7 +51,9 @@ def test_the_second_start_reads_what_the_first_one_built(
     with patch.object(quad_index, "build", side_effect=AssertionError):
         assert_same(index_file.quads(sky, height_rad), built)
     newest = max(index_file.folder().glob("*.bin"), key=lambda path: path.stat().st_mtime_ns)
-    assert_same(index_file.read(newest), built)
+    mapped = index_file.read(newest)
+    index_file.release()
+    assert_same(mapped, built)
 
 
 def resident_bytes(path: Path) -> int:

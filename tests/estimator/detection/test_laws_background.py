@@ -120,7 +120,7 @@ def test_searches_use_the_given_floor_or_the_usual_one(sigma_px: float | None) -
     assert found == (0.1 if sigma_px is None else sigma_px)
 
 
-@law(background.is_steep)
+@law()
 @given(rng=SEEDS, height=some.integers(1, 6), width=some.integers(1, 6))
 def test_a_sky_is_steep_if_many_steps_exceed_the_noise(
     rng: np.random.Generator, height: int, width: int

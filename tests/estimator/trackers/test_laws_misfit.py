@@ -295,6 +295,7 @@ def test_a_search_takes_plain_tuples_and_no_centroids_that_show_companions(
     """numba takes three times as long to read a named tuple as a plain one, in each call."""
     _, centroids = field(tracker, 5, CAMERA)
     assert tracker.solve_centroids(centroids).solved
+    assert misfit.identify.signatures
     for lights, (sensor, sky), *_ in misfit.identify.signatures:
         for read in (lights, sensor, sky):
             assert not isinstance(read, types.NamedTuple | types.NamedUniTuple)

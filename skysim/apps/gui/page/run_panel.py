@@ -265,7 +265,7 @@ class RunPanel:
             flown = f"flight of {Path(self.page.state.scene).name}: {rms_line(self.rows)}"
             self.page.log(flown if done else f"{flown}; stopped")
         if self.wanted_s is not None:
-            await self.show_moment(self.wanted_s)
+            await self.show_linked(self.wanted_s)
             self.wanted_s = None
             if self.when_shown:
                 self.when_shown()
@@ -371,13 +371,20 @@ class RunPanel:
             Called after this computation
         """
         if self.is_ready:
-            await self.show_moment(t_s)
+            await self.show_linked(t_s)
             return
         self.wanted_s = t_s
         self.when_shown = when_shown
         if not self.computing:
             self.page.show_panel("Run")
             ui.timer(0, self.simulate, once=True)
+
+    async def show_linked(self, t_s: float) -> None:
+        """Show the moment of an address; say it if the flight has no such time."""
+        await self.show_moment(t_s)
+        if self.rows and t_s > TIME_S(self.rows[-1]) + 1e-4:  # an address rounds to this
+            last_s = TIME_S(self.rows[-1])
+            self.page.show_message(f"{t_s:g} s is after the last frame, at {last_s:g} s")
 
     # Playing.
 
@@ -431,9 +438,6 @@ class RunPanel:
         if self.is_ready:
             self.pause()
             await self.show_index(nearest(self.rows, t_s))
-            last_s = TIME_S(self.rows[-1])
-            if t_s > last_s + 1e-4:  # an address rounds to this
-                self.page.show_message(f"{t_s:g} s is after the last frame, at {last_s:g} s")
 
     async def slid(self, event: Any) -> None:
         """Show the frame at the position of the dragged slider; skip all but the newest position."""
