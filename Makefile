@@ -10,7 +10,7 @@ LOWEST := out/lowest
 # Extras, e.g. dev+catalog: by uv, in a fifth of pip's time, or else by pip. uv has its own setting of an index, UV_DEFAULT_INDEX.
 comma := ,
 editable = -e '.[$(subst +,$(comma),$(1))]'
-install = $(BIN)/uv pip install --quiet --python $(BIN)/python $(if $(LOCK),-c $(LOCK)) $(editable) || $(PIP) $(editable)
+install = $(BIN)/uv pip install --quiet --compile-bytecode --python $(BIN)/python $(if $(LOCK),-c $(LOCK)) $(editable) || $(PIP) $(editable)
 
 $(READY): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "skysim needs Python 3.11 or newer")'
