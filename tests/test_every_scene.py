@@ -64,7 +64,14 @@ class Flown(NamedTuple):
         return self.flight.lab.scene
 
 
-@pytest.fixture(scope="module", params=NAMES)
+# Their identifiers are those of the papers, which no other quick test compiles: ten to twenty seconds each.
+COMPILED = ("ptase_monte_carlo", "ptase_table_2", "shefex_night", "nps_bench")
+FLOWN = [
+    pytest.param(name, marks=[pytest.mark.compiles] * (name in COMPILED)) for name in NAMES
+]
+
+
+@pytest.fixture(scope="module", params=FLOWN)
 def flown(request: pytest.FixtureRequest) -> Flown:
     flight = open_flight(scene_of(request.param, 2))
     return Flown(flight, list(flight.shots(cameras=[0])))

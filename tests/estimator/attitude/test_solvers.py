@@ -261,6 +261,7 @@ CASES = [
 ]
 
 
+@pytest.mark.compiles
 @pytest.mark.parametrize("case", CASES)
 def test_all_methods_give_the_same_optimum_on_the_same_data(case: str) -> None:
     rng = np.random.default_rng(50)
