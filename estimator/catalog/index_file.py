@@ -17,7 +17,7 @@ import tempfile
 import zlib
 from contextlib import suppress
 from pathlib import Path
-from weakref import ref
+from weakref import WeakSet
 
 import numpy as np
 
@@ -30,7 +30,7 @@ FORM = b"quads 1"
 FEW_STARS = 50_000
 MOST_FILES = 8
 HEAD = SIDE**4 + 1  # words of `first`
-MAPPED: list[ref[mmap.mmap]] = []  # maps of the files, those that are gone too
+MAPPED = WeakSet[mmap.mmap]()  # maps of the files that are in use
 WHOLE_CRC = 0x2144DF1C  # CRC-32 of any bytes followed by their CRC-32, the low byte first
 
 
@@ -69,9 +69,8 @@ def quads(sky: SkyIndex, height_rad: float) -> QuadIndex:
 
 def release() -> None:
     """Give the pages of all mapped files back. They count as memory, and are mapped again where they are read."""
-    for mapped in MAPPED:
-        pages = mapped()
-        if pages and hasattr(pages, "madvise"):  # not on all systems
+    for pages in list(MAPPED):
+        if hasattr(pages, "madvise"):  # not on all systems
             pages.madvise(mmap.MADV_DONTNEED)
 
 
@@ -84,7 +83,7 @@ def read(path: Path) -> QuadIndex:
             crc = zlib.crc32(part, crc)
         # Copy on write: compiled code has one version, for arrays that can be written.
         pages = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-    MAPPED.append(ref(pages))
+    MAPPED.add(pages)
     words = np.frombuffer(pages, np.int32)
     if len(words) <= HEAD or crc != WHOLE_CRC:
         raise ValueError(f"{path}: damaged")

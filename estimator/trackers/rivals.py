@@ -121,12 +121,7 @@ def with_rivals(
                 zero_point_mag=float(np.mean(zero_mag)),
                 magnitude_sigma=hypot(MAGNITUDE_SIGMA, np.std(zero_mag)),
             )
-            unmatched = _unmatched(lights, view, rest)
-            if quads is None:
-                found = star_search.lost_in_space(unmatched, sky, MOST_LIGHTS, MAX_CHECKS)
-            else:
-                effort = MOST_LIGHTS, QUAD_CHECKS
-                found = star_quads.identify(unmatched, quads, sky, *effort, False)
+            found = _find(_unmatched(lights, view, rest), sky, quads)
             if len(found.star):
                 break
         if not len(found.star):
@@ -180,7 +175,14 @@ def _is_comparable(matches: int, fewer: int, share: float) -> bool:
     return log10_tail(matches + fewer, matches, share) > LOG10_COMPARABLE
 
 
+def _find(detections: Detections, sky: SkyIndex, quads: QuadIndex | None) -> Solution:
+    """Search for a second sky: step 2 of the module. A frame's own search is called, so that it is compiled once."""
+    if quads is None:
+        return star_search.lost_in_space(detections, sky, MOST_LIGHTS, MAX_CHECKS)
+    return star_quads.identify(detections, quads, sky, MOST_LIGHTS, QUAD_CHECKS, False)
+
+
 @jit
 def _unmatched(lights: FlatCentroids, sensor: Sensor, rest: NDArray) -> Detections:
-    """Some rows of the lights. They are searched as a frame's lights are, so the search is compiled once."""
+    """Some rows of the lights, as detections."""
     return chosen(detections_of(lights, sensor, 0.0), rest)

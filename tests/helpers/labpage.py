@@ -166,7 +166,7 @@ def second(browser: Any, server: Server) -> Iterator[Any]:
 
 
 def pictured(page: Any, name: str) -> None:
-    """Save a screenshot, except in CI, where nobody sees it."""
+    """Save a screenshot of the page; in CI nobody looks at it, so none is saved."""
     if os.environ.get("CI"):
         return
     PICTURES.mkdir(parents=True, exist_ok=True)
