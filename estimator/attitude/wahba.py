@@ -25,7 +25,7 @@ import numpy as np
 from estimator.core import least_squares
 from estimator.core.checks import Floats
 from estimator.core.jit import jit
-from estimator.core.vectors import cross, dot, norm, rotate, rotate_in_place, row
+from estimator.core.vectors import cross, dot, norm, rotate, rotate_in_place, row, set_row
 
 Quaternion = tuple[float, float, float, float]
 
@@ -440,7 +440,7 @@ def matrix_of(q: Quaternion | Floats) -> Floats:
     x, y, z, w = q
     s = 2 / (x * x + y * y + z * z + w * w)
     R = np.empty((3, 3))
-    R[0] = 1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)
-    R[1] = s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)
-    R[2] = s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)
+    set_row(R, 0, (1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)))
+    set_row(R, 1, (s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)))
+    set_row(R, 2, (s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)))
     return R

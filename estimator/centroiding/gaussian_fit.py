@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.core import least_squares
 from estimator.core.checks import Floats, Ints
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
 # Half-width of the window, and its largest value, for a saturated star.
@@ -146,12 +146,15 @@ def _fit(
     return False
 
 
-@jit
+@inlined
 def _write_star(factor: Floats, p: Floats, pixels: int, column: Floats, out: Floats) -> None:
     """Write x, y, sigma of the position and flux of a star; `column` (5,) is a work array."""
     xx, yy, _ = least_squares.position_covariance(factor, column)
     inflation = least_squares.misfit_factor(factor[5, 5], pixels - 5)
-    out[:] = p[X], p[Y], sqrt((xx + yy) / 2 * inflation), p[FLUX]
+    out[0] = p[X]
+    out[1] = p[Y]
+    out[2] = sqrt((xx + yy) / 2 * inflation)
+    out[3] = p[FLUX]
 
 
 @jit

@@ -280,7 +280,7 @@ def distorted(tangent: Floats, distortion: Distortion) -> Floats:
     """Apply the distortion to (N, 2) tangents."""
     out = np.empty_like(tangent)
     for n in range(len(tangent)):
-        out[n] = _distort(tangent[n, 0], tangent[n, 1], distortion)
+        out[n, 0], out[n, 1] = _distort(tangent[n, 0], tangent[n, 1], distortion)
     return out
 
 
@@ -311,7 +311,8 @@ def undistorted(
             y = y + measured_y - distorted_y
             if max(abs(measured_x - distorted_x), abs(measured_y - distorted_y)) < 1e-15:
                 break
-        out[n] = x, y
+        out[n, 0] = x
+        out[n, 1] = y
     return out
 
 

@@ -20,6 +20,8 @@ jit = partial(
     no_cfunc_wrapper=True,
     nogil=True,
 )
+# For functions that one other function calls: LLVM optimizes a called function by itself, and once more in its caller.
+inlined = partial(jit, inline="always")
 
 COMPILATION = event.TimingListener()
 # numba holds the lock while it compiles a function, and while it loads compiled code.

@@ -75,7 +75,8 @@ def step(normal: Floats, out: Floats) -> float:
     if not cholesky(normal[:count, :count]):
         return np.nan
     # N dp = g
-    out[:] = normal[count, :count]
+    for i in range(count):
+        out[i] = normal[count, i]
     cholesky_solve(normal, out)
     # g^T dp
     fall = 0.0

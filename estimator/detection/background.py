@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from estimator.core.checks import Floats
 from estimator.core.constants import SIGMA_PER_MAD
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import Background, Blobs, FramePriors
 
 TILE_PX = 64
@@ -319,7 +319,7 @@ def median(values: Floats) -> float:
     return float(np.median(values))
 
 
-@jit
+@inlined
 def _robust_estimate(values: NDArray, samples: NDArray) -> tuple[float, float]:
     """Return median and 1.4826 MAD (a Gaussian's sigma) of len(samples) of the values, at even distances."""
     count = len(samples)

@@ -544,5 +544,7 @@ def _shapes(image: NDArray, boxes: Ints, level: Floats, noise: Floats) -> Floats
             xy = xy / total - x_sum * y_sum / total**2
             # The variance across is the smaller eigenvalue of the matrix of second moments.
             eigenvalue_gap = np.sqrt((xx - yy) ** 2 + 4 * xy * xy)
-            out[n, 2:] = (xx + yy - eigenvalue_gap) / 2, 12 * (xx - yy), 24 * xy
+            out[n, 2] = (xx + yy - eigenvalue_gap) / 2
+            out[n, 3] = 12 * (xx - yy)
+            out[n, 4] = 24 * xy
     return out

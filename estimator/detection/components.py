@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimator.core.checks import Floats, Ints, Ints32
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
+from estimator.core.vectors import set_row
 from estimator.detection.background import (
     accumulator_type,
     filtered,
@@ -132,7 +133,7 @@ def _scan(
     return int(count)
 
 
-@jit
+@inlined
 def _add_pixels(
     mask: NDArray,
     start: int,
@@ -172,7 +173,7 @@ def _add_pixels(
     return count
 
 
-@jit
+@inlined
 def _sum_taps(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> None:
     """Sum the filtered rows over the taps around row y; rows beyond the frame repeat its edge."""
     reach = len(ring) // 2
@@ -185,7 +186,7 @@ def _sum_taps(ring: NDArray, taps: Ints, y: int, height: int, out: NDArray) -> N
             out[x] += shifted[x]
 
 
-@jit
+@inlined
 def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray) -> None:
     """Write 16 times the filtered row to `out`, padded at both ends by repeating the end values."""
     inner = out[reach : len(out) - reach]
@@ -194,18 +195,18 @@ def _padded_row(image: NDArray, y: int, reach: int, sums: NDArray, out: NDArray)
     out[:reach] = inner[0]
 
 
-@jit
+@inlined
 def _extend(runs: Ints32, count: int, y: int, x: int) -> int:
     """Extend the last run by pixel (y, x), or begin a new run; return the number of runs."""
     if 0 < count <= len(runs) and runs[count - 1, 0] == y and runs[count - 1, 2] == x - 1:
         runs[count - 1, 2] = x
         return count
     if count < len(runs):
-        runs[count] = y, x, x
+        set_row(runs, count, (y, x, x))
     return count + 1
 
 
-@jit
+@inlined
 def _lower_bounds(
     threshold: Floats, height: int, y: int, cell: int, scale: float, bound: NDArray
 ) -> int:

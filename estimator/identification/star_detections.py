@@ -215,7 +215,7 @@ def detections_of(
         sigma[n] = sqrt((xx + yy) / 2 + hypot((xx - yy) / 2, xy)) / focal_px
         # The inverse of [xx xy; xy yy] is [yy -xy; -xy xx] / (xx yy - xy^2).
         scale = focal_px**2 / (xx * yy - xy * xy)
-        weight[n] = yy * scale, xx * scale, -xy * scale
+        vectors.set_row(weight, n, (yy * scale, xx * scale, -xy * scale))
         mag[n] = sensor.zero_point_mag - 2.5 * log10(flux[n])
     tangent = undistorted(
         xy_px, focal_px, center_x, center_y, sensor.distortion, sensor.aspect
@@ -354,6 +354,13 @@ def ray(tangent: Floats, n: int, focal_ratio: float) -> vectors.Vector:
     y = tangent[n, 1] / focal_ratio
     inverse = 1 / sqrt(x * x + y * y + 1)
     return x * inverse, y * inverse, inverse
+
+
+@jit
+def squared_corner(field: Floats) -> float:
+    """Return the squared tangent of the farthest corner of a field (`Detections.field`)."""
+    left, right, top, bottom = field
+    return max(left * left, right * right) + max(top * top, bottom * bottom)
 
 
 @jit

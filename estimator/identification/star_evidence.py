@@ -41,9 +41,15 @@ from estimator.catalog.sky_index import (
 )
 from estimator.core import least_squares, vectors
 from estimator.core.checks import Floats
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.identification.chance import GATE_SIGMA, MIN_EVIDENCE_MATCHES, counts_dex
-from estimator.identification.star_detections import Detections, field_area, gates_of, ray
+from estimator.identification.star_detections import (
+    Detections,
+    field_area,
+    gates_of,
+    ray,
+    squared_corner,
+)
 
 MAG_OUTLIER_FRACTION = 0.05  # of stars: variables, doubles, an unusual passband
 # Penalty for each detection brighter than the faintest match that is unmatched, in excess of the number of matches.
@@ -116,7 +122,7 @@ def no_hypothesis(dex: float = -np.inf) -> Hypothesis:
     return Hypothesis(none, none, np.eye(3), 1.0, np.eye(4), dex)
 
 
-@jit
+@inlined
 def prior_volume_dex(detections: Detections) -> float:
     """log10 of the prior volume: 8 pi^2 of attitudes, times the width of the interval of log focal_ratio."""
     width = 2 * detections.focal_uncertainty
@@ -246,7 +252,7 @@ def _match(
     return observed[:count], star[:count]
 
 
-@jit
+@inlined
 def focal_gain_dex(detections: Detections, sky: SkyIndex, hypothesis: Hypothesis) -> float:
     """log10 of the Bayes factor of a free focal length to the hypothesis's own focal length, with the same matches.
 
@@ -388,7 +394,7 @@ def factorize(a: Floats) -> None:
             a[i, j] = sqrt(max(a[i, i], 1e-300)) if i == j else a[i, j] / a[j, j]
 
 
-@jit
+@inlined
 def _count_missing(
     detections: Detections, sky: SkyIndex, R: Floats, focal_ratio: float, star: NDArray
 ) -> int:
@@ -402,7 +408,8 @@ def _count_missing(
     star
         (K,) rows of the matched stars
     """
-    left, right, top, bottom = detections.field * (INNER_FRACTION / focal_ratio)
+    inner = detections.field * (INNER_FRACTION / focal_ratio)
+    left, right, top, bottom = inner
     # Stars are sorted by brightness: the row of the faintest detectable star bounds them all.
     matched = 0
     faintest = np.int64(0)
@@ -412,10 +419,8 @@ def _count_missing(
         x, y = project(sky.vectors, R, s)
         matched += left < x < right and top < y < bottom
         faintest = max(faintest, s)
-    # Chord of the angle from the boresight to the farthest corner.
-    corner2 = max(left * left, right * right) + max(top * top, bottom * bottom)
-    # A hair longer, so that rounding excludes no star in a corner.
-    chord = sqrt(2 - 2 / sqrt(1 + corner2)) * (1 + 1e-9)
+    # Chord of the angle from the boresight to the farthest corner; a hair longer, so that rounding excludes no star.
+    chord = sqrt(2 - 2 / sqrt(1 + squared_corner(inner))) * (1 + 1e-9)
     bx, by, bz = vectors.row(R, 2)
     # Stars within the circle around the field, then those in the field.
     near = np.empty(len(sky.vectors), np.int64)
@@ -507,7 +512,7 @@ def _ways_dex(lights: int, matched: int) -> float:
     return (lgamma(lights + 1.0) - lgamma(lights - matched + 1.0)) / log(10.0)
 
 
-@jit
+@inlined
 def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
     """Fraction of the stars that are at least as bright as the faintest detection; 1 if magnitudes are unknown."""
     faintest = mag.max()
@@ -518,7 +523,7 @@ def _fraction_brighter(sky: SkyIndex, mag: Floats) -> float:
     )
 
 
-@jit
+@inlined
 def _magnitude_ratio(
     detections: Detections, sky: SkyIndex, detection: int, star: int, fraction_brighter: float
 ) -> float:

@@ -36,7 +36,7 @@ from numpy.typing import NDArray
 from estimator.catalog.sky_index import SkyIndex, cell_of
 from estimator.core import vectors
 from estimator.core.checks import Floats
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.identification.chance import (
     ACCEPT_DEX,
     GATE_SIGMA,
@@ -52,6 +52,7 @@ from estimator.identification.star_detections import (
     pair_gates,
     ray,
     spread,
+    squared_corner,
 )
 from estimator.identification.star_evidence import (
     FOCAL_MARGIN,
@@ -65,9 +66,8 @@ from estimator.identification.star_evidence import (
 
 DECISIVE_DEX = 10.0  # evidence at which the search stops without looking for rivals
 MARGIN_DEX = 3.0  # by which the solution must beat every other attitude
-NO_RIVAL_DEX = (
-    ACCEPT_DEX - MARGIN_DEX
-)  # below this an attitude is neither acceptable nor a rival
+# Below this an attitude is neither acceptable nor a rival.
+NO_RIVAL_DEX = ACCEPT_DEX - MARGIN_DEX
 # Effort to find rivals of an accepted attitude: a multiple of the effort so far, plus a number of star look-ups.
 RIVAL_EFFORT = 2
 MIN_RIVAL_EFFORT = 2000
@@ -75,13 +75,11 @@ MAG_GATE_SIGMA = 4.0  # greatest difference of magnitudes, in standard deviation
 # Cost of an evaluation in star look-ups. It is part of the effort, so that frames without a solution end in time.
 EVALUATION_COST = 15
 SHORTEST = 0.07  # of the field's size: shorter pairs are tried last
-WRONG_FOCAL = (
-    0.05  # greatest relative error of a calibrated focal length that step 9 can find
-)
+# Greatest relative error of a calibrated focal length that step 9 can find
+WRONG_FOCAL = 0.05
 WRONG_FOCAL_DEX = 2.0  # evidence by which another focal length must beat the calibrated one
-FREE_DEX = (
-    1.0  # least gain by a free focal length, with the same matches, for which it is tried
-)
+# Least gain by a free focal length, with the same matches, for which it is tried
+FREE_DEX = 1.0
 PARTNERS = 12  # of a hub
 MAX_LINKS = 2**16  # catalog pairs of a hub that are kept
 MAX_CLOSED = 2**12  # triangles of a hub and one partner
@@ -111,9 +109,8 @@ def lost_in_space(
         Empty if the search finds nothing beyond chance, or if all detections together do not confirm what it finds
     """
     # 1. Choose the detections to search with.
-    searched = chosen(
-        detections, spread(detections.tangent, detections.field, max_detections)
-    )
+    rows = spread(detections.tangent, detections.field, max_detections)
+    searched = chosen(detections, rows)
     # 2. to 8. The search.
     candidate = search(searched, stars, max_checks)
     # 9. Fit to all detections. A calibrated camera may be wrong by up to WRONG_FOCAL.
@@ -122,8 +119,7 @@ def lost_in_space(
     return fit_to_all(free, stars, candidate, calibrated)
 
 
-# Inlined, as is `_test_partner`: LLVM optimizes a called function once more with each of its callers.
-@jit(inline="always")
+@inlined
 def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis:
     """Steps 2 to 8: search one set of detections for the attitude.
 
@@ -177,15 +173,19 @@ def search(detections: Detections, sky: SkyIndex, max_checks: int) -> Hypothesis
 def _same_attitude(first: Hypothesis, second: Hypothesis) -> bool:
     """Whether two hypotheses have the same attitude within 5.7 degrees; False if `second` is empty.
 
-    The trace of R1^T R2 is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
+    The trace of R1^T R2, the sum of the products of their elements, is 1 + 2 cos(angle): 2.99 for 5.7 degrees.
     """
     if second.dex == -np.inf:
         return False
-    # trace(R1^T R2) = sum of the products of the elements.
-    return bool(np.sum(first.R_cam_from_ref * second.R_cam_from_ref) > 2.99)
+    R1 = first.R_cam_from_ref
+    R2 = second.R_cam_from_ref
+    trace = 0.0
+    for n in range(3):
+        trace += vectors.dot(vectors.row(R1, n), vectors.row(R2, n))
+    return trace > 2.99
 
 
-@jit
+@inlined
 def _crowds(detections: Detections) -> tuple[Floats, NDArray]:
     """Numbers of detections within SHORTEST of the field, and the hubs: those first that are bright and alone.
 
@@ -207,7 +207,7 @@ def _crowds(detections: Detections) -> tuple[Floats, NDArray]:
     return crowd, np.argsort((np.arange(total) + 1) * crowd)
 
 
-@jit
+@inlined
 def _pair_costs(detections: Detections, crowd: Floats, hub: int) -> Floats:
     """(N,) costs of the pairs of a hub and each detection, infinite for the hub itself.
 
@@ -254,7 +254,7 @@ class Links(NamedTuple):
     closed: NDArray[np.int64]
 
 
-@jit
+@inlined
 def _no_links(stars: int) -> Links:
     """No entry for any star: zeros, which take no time, as the system provides them when they are used."""
     return Links(
@@ -266,7 +266,7 @@ def _no_links(stars: int) -> Links:
     )
 
 
-@jit
+@inlined
 def _clear(links: Links) -> None:
     """Remove all entries."""
     for n in range(links.total[0]):
@@ -274,7 +274,7 @@ def _clear(links: Links) -> None:
     links.total[0] = 0
 
 
-@jit(inline="always")
+@inlined
 def _test_partner(
     detections: Detections,
     sky: SkyIndex,
@@ -328,7 +328,7 @@ def _test_partner(
     return best
 
 
-@jit
+@inlined
 def _close(
     pairs: tuple[NDArray, NDArray, int, int, float],
     star: Floats,
@@ -397,10 +397,12 @@ def _close(
                 if wanted[q, 2] * vectors.dot(vectors.row(star, i), normal) < 0:
                     continue
                 if found < len(closed):
-                    closed[found] = i, k
+                    closed[found, 0] = i
+                    closed[found, 1] = k
                     found += 1
             if count < len(entries):
-                entries[count] = i, k, p, last[i]
+                vectors.set_row(entries, count, (i, k, p))
+                entries[count, 3] = last[i]
                 ratios[count] = ratio
                 count += 1
                 last[i] = count
@@ -408,7 +410,7 @@ def _close(
     return found, tests + first[high + 1] - first[low]
 
 
-@jit
+@inlined
 def _wanted(detections: Detections, hub: int, partners: NDArray, tolerance: float) -> Floats:
     """What stars must satisfy to form the triangle of a hub, its last partner, and each earlier partner.
 
@@ -427,7 +429,7 @@ def _wanted(detections: Detections, hub: int, partners: NDArray, tolerance: floa
     out = np.empty((len(partners), 4))
     y = partners[-1]
     u = FOCAL_MARGIN * detections.focal_uncertainty
-    r2 = np.max(detections.field**2) + np.min(detections.field**2)
+    r2 = squared_corner(detections.field)
     slack = 2 * u * r2 / (1 + r2) + (tolerance if u > 0 else 0.0)
     ray_hub = ray(tangent, hub, 1.0)
     ray_y = ray(tangent, y, 1.0)
@@ -445,7 +447,7 @@ def _wanted(detections: Detections, hub: int, partners: NDArray, tolerance: floa
     return out
 
 
-@jit
+@inlined
 def pair_hypothesis(
     detections: Detections,
     sky: SkyIndex,
@@ -482,9 +484,8 @@ def pair_hypothesis(
     vectors.pair_frame(ray(tangent, a, ratio), ray(tangent, b, ratio), in_cam)
     vectors.pair_frame(star_a, star_b, in_ref)
     vectors.multiply_transposed(in_cam, in_ref, R_cam_from_ref)
-    return evaluate(
-        detections, sky, R_cam_from_ref, ratio, pair_gates(detections, a, b), min_dex
-    )
+    gates = pair_gates(detections, a, b)
+    return evaluate(detections, sky, R_cam_from_ref, ratio, gates, min_dex)
 
 
 @jit
@@ -541,13 +542,12 @@ def fit_focal_ratio(tangent: Floats, a: int, b: int, target: float) -> float:
     focal_ratio = 1.0
     # f <- f chord(f) / target
     for _ in range(3):
-        focal_ratio *= (
-            vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio)) / target
-        )
+        chord = vectors.chord(ray(tangent, a, focal_ratio), ray(tangent, b, focal_ratio))
+        focal_ratio *= chord / target
     return focal_ratio
 
 
-@jit
+@inlined
 def fit_to_all(
     detections: Detections,
     stars: SkyIndex,

@@ -143,13 +143,15 @@ def _scaled(solution: Solution, parameters: int) -> tuple[Solution, float]:
     """
     count = len(solution.star)
     chi2 = solution.chi2 * max(2 * count - parameters, 1)
-    gain_dex = chi2 / 2 / log(10.0) * (1 - 1 / TRIED)
-    gain_dex += (parameters / 2 - count) * np.log10(TRIED)
-    found_dex = gain_dex.copy()
-    gain_dex[1:] += PRIOR_WRONG_DEX
-    best = np.argmax(gain_dex)
-    variance = _mean_factor(gain_dex, gain_dex[best])
-    dex = solution.dex + found_dex[best]
+    gain_dex = np.empty(len(TRIED))
+    weighted_dex = np.empty(len(TRIED))
+    for n in range(len(TRIED)):
+        gain_dex[n] = chi2 / 2 / log(10.0) * (1 - 1 / TRIED[n])
+        gain_dex[n] += (parameters / 2 - count) * log10(TRIED[n])
+        weighted_dex[n] = gain_dex[n] + (PRIOR_WRONG_DEX if n else 0.0)
+    best = np.argmax(weighted_dex)
+    variance = _mean_factor(weighted_dex, weighted_dex[best])
+    dex = solution.dex + gain_dex[best]
     return with_errors(solution, variance, solution.chi2 / TRIED[best], dex), variance
 
 

@@ -1,13 +1,13 @@
-"""Compile the tracker in a second process while the first one compiles the renderer, which halves the time.
+"""Compile the identification in a second process while the first one compiles the rest, which halves the time.
 
-numba compiles one function at a time and keeps the result on disk, where every process finds it. The packages skysim
-and estimator share no compiled function, so two processes can compile them at once:
+numba compiles one function at a time and keeps the result on disk, where every process finds it. Identification is
+about half of all compiled code, so two processes can compile it and the rest at once:
 
-1. `TrackerCompilation` starts the second process when the first function of skysim is compiled.
+1. `IdentificationCompilation` starts the second process when the first function of skysim is compiled.
 2. The second process, `python -m skysim.simulation.compilation SCENE [KEY=VALUE ...]`, builds the scene's tracker and
-   solves a synthetic frame, which needs no renderer.
-3. Before the first process compiles a function of estimator, it waits for the second one. Later functions then come
-   from numba's cache.
+   identifies lights at given pixels, which needs no frame.
+3. The first process compiles the renderer, the detector and the centroider. Before it compiles a function of the
+   identification, it waits for the second one. Such functions then come from numba's cache.
 """
 
 import gc
@@ -20,24 +20,22 @@ import numpy as np
 from numba.core import event
 from scipy.spatial.transform import Rotation
 
-from skysim.camera.detector import saturation_dn
+from estimator.core.types import Attitude, Centroids
 from skysim.core.errors import InputError
 from skysim.core.guarded import PYTHON
-from skysim.core.random_streams import random_stream
-from skysim.core.types import Frame
 from skysim.core.yaml_reader import parse_overrides
 from skysim.scene import loader
 from skysim.simulation.lab import StarCamera, build_lab, build_tracker, exposure_window
 from skysim.tracking import factory
 from skysim.tracking.onboard_model import assumed_camera
 
-# Wide enough for the smallest area of every shipped scene: without detections, no later stage would be compiled.
-SPOT_SIGMA_PX = 2.0
-NOISE_DN = 3.0
 MAX_SPOTS = 50
+SIGMA_PX = 0.1
+# Packages for which the first process waits
+IDENTIFICATION = ("estimator.catalog", "estimator.identification", "estimator.trackers")
 
 
-class TrackerCompilation(event.Listener):
+class IdentificationCompilation(event.Listener):
     """Listener to numba that starts the second process, and waits for it, as the module's docstring says."""
 
     def __init__(self, arguments: Sequence[str]) -> None:
@@ -54,7 +52,7 @@ class TrackerCompilation(event.Listener):
             )
             # The collector would go through all that is imported again and again.
             gc.freeze()
-        elif self.process is not None and module.startswith("estimator."):
+        elif self.process is not None and module.startswith(IDENTIFICATION):
             self.process.wait()
             gc.unfreeze()
 
@@ -64,8 +62,8 @@ class TrackerCompilation(event.Listener):
 
 @contextmanager
 def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]:
-    """Within this context, compile the scene's tracker in a second process if the renderer must be compiled."""
-    listener = TrackerCompilation(
+    """Within this context, compile the identification in a second process if the renderer must be compiled."""
+    listener = IdentificationCompilation(
         [scene, *(f"{key}={value}" for key, value in overrides.items())]
     )
     event.register("numba:compile", listener)
@@ -78,44 +76,28 @@ def on_two_processes(scene: str, overrides: Mapping[str, str]) -> Iterator[None]
             listener.process.wait()
 
 
-def warm_up(camera: StarCamera, lab_from_body: Rotation, tracker: factory.Estimator) -> None:
-    """Solve a synthetic frame so that numba compiles before timing.
-
-    External trackers are skipped: each frame must reach them once, in order.
-    """
-    if not isinstance(tracker, factory.UserTracker):
-        factory.solve_frame(tracker, synthetic_frame(camera, lab_from_body))
-
-
-def synthetic_frame(camera: StarCamera, lab_from_body: Rotation) -> Frame:
-    """A frame at an attitude with equal Gaussian spots at the brightest LEDs or stars; it needs no renderer."""
-    # 1. Pixel positions of the sources in front of the camera.
+def identify_spots(
+    camera: StarCamera, lab_from_body: Rotation, tracker: factory.Estimator
+) -> Attitude:
+    """The tracker's attitude from equal spots at the brightest LEDs or stars."""
     assumed = assumed_camera(camera.scene)
-    when = exposure_window(camera.scene, 0)
     place = camera.sources.place[np.argsort(camera.sources.magnitude, kind="stable")]
     vectors_cam = camera.mount.toward(place, lab_from_body)
     xy_px = assumed.pixels(vectors_cam[vectors_cam[:, 2] > 0])
     xy_px = xy_px[assumed.contains(xy_px)][:MAX_SPOTS]
-    # 2. Background with noise, and the spots.
-    full_dn = saturation_dn(camera.scene.camera.detector)
-    image_dn = random_stream(0).normal(
-        0.1 * full_dn, NOISE_DN, (assumed.height_px, assumed.width_px)
-    )
-    down, along = (
-        np.exp(-(((at_px[:, None] - np.arange(size)) / SPOT_SIGMA_PX) ** 2) / 2)
-        for at_px, size in zip(xy_px.T[::-1], image_dn.shape, strict=True)
-    )
-    image_dn += 0.5 * full_dn * down.T @ along
-    image = np.clip(image_dn, 0, full_dn).astype(np.uint16)
-    return Frame(0, image, when.open_s, when.exposure_s, full_dn)
+    centroids = Centroids(xy_px, np.full(len(xy_px), SIGMA_PX), np.ones(len(xy_px)))
+    exposure_s = exposure_window(camera.scene, 0).exposure_s
+    return factory.solve_centroids(tracker, centroids, exposure_s)
 
 
 if __name__ == "__main__":
-    # Build a scene's tracker and solve a synthetic frame with it; external trackers are skipped.
+    # Build a scene's tracker and identify spots with it; an external one has nothing to compile.
     gc.disable()  # a short life: collecting the compiler's objects takes 6 % of it
     name, *texts = sys.argv[1:]
     try:
         lab = build_lab(loader.load(name, parse_overrides(texts)))
-        warm_up(lab.camera, lab.start, build_tracker(lab.camera))
+        tracker = build_tracker(lab.camera)
+        if not isinstance(tracker, factory.UserTracker):
+            identify_spots(lab.camera, lab.start, tracker)
     except InputError as error:
         sys.exit(str(error))

@@ -1,8 +1,8 @@
 """Fill numba's cache before tests: `python -m tests.helpers.compilation [--basic]`, in two processes at once.
 
-skysim and the estimator call no compiled function of each other, so one process for each compiles nothing twice. What
-two steps of a process need is compiled by the first. The basic steps are those of `make test` in a fresh clone: what
-most tests need. All steps run once in CI, beside other work: most of what the slow tests need, too.
+One process begins with the identification of stars, the other with the renderer. What two steps of a process need is
+compiled by the first. The basic steps are those of `make test` in a fresh clone: what most tests need. All steps run
+once in CI, beside other work: most of what the slow tests need, too.
 """
 
 from __future__ import annotations
@@ -22,18 +22,21 @@ from skysim.core.paths import ROOT
 
 POLL_S = 0.5
 Step = Sequence[str]  # words after `python -m`; {folder} is a temporary folder
-TRACKER = "skysim.simulation.compilation"
+IDENTIFY = "skysim.simulation.compilation"
 FRAME = ("--frames", "1", "--out", "{folder}")
+ALGORITHMS = ("tests.helpers.compilation", "--algorithms")  # and stages
 BLIND = ("skysim", "solve", "{folder}/frame_0000.png")
 BASIC: tuple[tuple[Step, ...], ...] = (
-    ((TRACKER, "shefex2"), ("skysim", "render", "shefex2", *FRAME), BLIND),
-    (("skysim", "render", "afit_simsat", *FRAME), (TRACKER, "afit_simsat")),
+    ((IDENTIFY, "shefex2"), ("skysim", "run", "shefex2", *FRAME), BLIND),
+    (("skysim", "render", "afit_simsat", *FRAME), ("skysim", "run", "afit_simsat", *FRAME)),
 )
 # After the basic steps. Of the estimator: codes, and every algorithm that a setting can name.
 # Of skysim: motion under control and a gyro, a second camera, a panel of LEDs.
 FURTHER: tuple[tuple[Step, ...], ...] = (
-    ((TRACKER, "coded_spiral"), ("tests.helpers.compilation", "--algorithms")),
+    ((*ALGORITHMS, "identifier"),),
     (
+        (*ALGORITHMS, "detector", "centroider", "solver"),
+        ("skysim", "run", "coded_spiral", *FRAME),
         ("skysim", "run", "simsat_cmg", *FRAME),
         ("skysim", "render", "two_heads", *FRAME),
         ("skysim", "render", "nps_tas2", *FRAME),
@@ -51,8 +54,8 @@ def compile_steps(steps: Sequence[Step], folder: Path, advance: Callable[[], Non
         advance()
 
 
-def compile_algorithms() -> None:
-    """Solve one synthetic frame by every algorithm that a setting can name, and search an LED layout."""
+def compile_algorithms(stages: Sequence[str]) -> None:
+    """Solve one synthetic frame by every algorithm that a setting can name for these stages."""
     from estimator import Camera, StarTracker
     from estimator.attitude.solvers import SOLVERS
     from estimator.centroiding.centroid import CENTROIDERS
@@ -62,13 +65,14 @@ def compile_algorithms() -> None:
     from estimator.trackers.pipeline import Settings
 
     camera = Camera.from_fov(640, 480, fov_deg=15)
-    for stage, names in (
-        ("detector", DETECTORS),
-        ("centroider", CENTROIDERS),
-        ("identifier", IDENTIFIERS),
-        ("solver", SOLVERS),
-    ):
-        for name in names:
+    tables = {
+        "detector": DETECTORS,
+        "centroider": CENTROIDERS,
+        "identifier": IDENTIFIERS,
+        "solver": SOLVERS,
+    }
+    for stage in stages:
+        for name in tables[stage]:
             tracker = StarTracker.for_sky(camera, settings=Settings(**{stage: name}))
             try:
                 tracker.warm_up()
@@ -79,7 +83,7 @@ def compile_algorithms() -> None:
 def main(words: Sequence[str]) -> None:
     """Compile the basic steps, or all, in as many processes as there are groups."""
     if "--algorithms" in words:
-        compile_algorithms()
+        compile_algorithms(words[1:])
         return
     groups = BASIC
     if "--basic" not in words:

@@ -1,4 +1,4 @@
-"""The tracker's compilation in a second process reaches every stage of it; the order of loading changes nothing."""
+"""Compilation in a second process reaches the end of identification; the order of loading changes nothing."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ import pytest
 
 from skysim.core.paths import ROOT, SCENES
 from skysim.scene import loader
-from skysim.simulation.compilation import synthetic_frame
+from skysim.simulation.compilation import identify_spots
 from skysim.simulation.lab import build_lab, build_tracker
-from skysim.tracking import factory
 
 # Too few or too regular LEDs for an attitude.
 SYMMETRIC = {"afit_test1", "afit_test2", "afit_test3"}
@@ -22,11 +21,10 @@ CODED = {"coded_spiral"}  # a frame alone does not name its LEDs
 NAMES = (
     {path.stem.removesuffix("_ideal") for path in SCENES.glob("*.yaml")} - SYMMETRIC - CODED
 )
-# Prints the modules of all functions that numba compiles for a command.
+# Prints the modules of all functions that numba compiles for a module that runs as a command.
 MODULES = """
-import json, sys
+import json, runpy, sys
 from numba.core import event
-from skysim.apps.cli.main import main
 found = set()
 class Modules(event.Listener):
     def on_start(self, compilation):
@@ -35,7 +33,7 @@ class Modules(event.Listener):
         pass
 event.register("numba:compile", Modules())
 try:
-    main()
+    runpy.run_module(sys.argv.pop(1), run_name="__main__")
 finally:
     json.dump(sorted(found), open("modules.json", "w"))
 """
@@ -63,13 +61,11 @@ print(shot.solution.centroids.xy_px.tobytes().hex(), attitude.cam_from_ref.as_qu
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(NAMES))
-def test_the_synthetic_frame_is_solved(name: str) -> None:
-    """A frame that is refused earlier would leave the later stages to be compiled in the first process."""
+def test_the_spots_are_identified(name: str) -> None:
+    """If they were refused, the last steps would be left to be compiled in the first process."""
     lab = build_lab(loader.load(name))
-    report = factory.solve_frame(
-        build_tracker(lab.camera), synthetic_frame(lab.camera, lab.start)
-    )
-    assert report.attitude.status == "solved"
+    attitude = identify_spots(lab.camera, lab.start, build_tracker(lab.camera))
+    assert attitude.status == "solved"
 
 
 @pytest.mark.slow
@@ -89,14 +85,27 @@ def test_a_frame_does_not_depend_on_the_functions_that_are_loaded_first(name: st
     assert first.stdout == plain.stdout, first.stderr
 
 
-@pytest.mark.slow
-def test_a_frame_of_stars_compiles_neither_ellipses_nor_text(tmp_path: Path) -> None:
+RENDER = ("skysim", "render", "shefex2", "--frames", "1", "--out", "frames")
+IDENTIFY = ("skysim.simulation.compilation", "shefex2")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        pytest.param(RENDER, marks=pytest.mark.slow),
+        pytest.param(IDENTIFY, marks=pytest.mark.long),
+    ],
+    ids=["render", "identify"],
+)
+def test_stars_compile_neither_ellipses_nor_text(
+    tmp_path: Path, words: tuple[str, ...]
+) -> None:
     """The images of disks are a third of the renderer; numba's texts of errors take seconds (`a[i] = array`)."""
     cache = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(ROOT)}
-    words = ["render", "shefex2", "--frames", "1", "--out", "frames"]
     command = [sys.executable, "-c", MODULES, *words]
     subprocess.run(command, cwd=tmp_path, env=cache, check=True, capture_output=True)
     compiled = json.loads((tmp_path / "modules.json").read_text())
-    assert "skysim.camera.psf.splat" in compiled
+    assert ("skysim.camera.psf.splat" in compiled) == (words == RENDER)
+    assert ("estimator.identification.star_search" in compiled) == (words == IDENTIFY)
     assert "skysim.camera.psf.ellipse" not in compiled
     assert "numba.cpython.unicode" not in compiled

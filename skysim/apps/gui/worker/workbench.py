@@ -35,7 +35,6 @@ from skysim.scene.loader import load
 from skysim.scene.scene import Scene
 from skysim.scene.sections.motion import PRESCRIBED
 from skysim.simulation import checks, exposure
-from skysim.simulation.compilation import warm_up
 from skysim.simulation.lab import (
     MAIN,
     Lab,
@@ -111,14 +110,14 @@ class Workbench:
         if before and keeps_lab and before.head == number:
             if former == scene:
                 return before
-            tracker = warm_tracker(lab)
+            tracker = build_tracker(lab.camera)
             return replace(before, scene=lab.scene, lab=lab, whole=whole, estimator=tracker)
         hardware = {"tracker": scene.tracker, "camera": scene.camera}
         keeps_attitude = former and former.with_values(**hardware) == scene
         return cls(
             lab.scene,
             lab,
-            warm_tracker(lab),
+            build_tracker(lab.camera),
             before.lab_from_body if before and keeps_attitude else lab.start,
             geometry.scene_lens(lab),
             geometry.lab_geometry(lab),
@@ -233,13 +232,6 @@ class Workbench:
             else None,
             1e3 * seconds,
         )
-
-
-def warm_tracker(lab: Lab) -> factory.Estimator:
-    """The scene's tracker, compiled, so that the time of its first frame does not include the compilation."""
-    tracker = build_tracker(lab.camera)
-    warm_up(lab.camera, lab.start, tracker)
-    return tracker
 
 
 def id_prefix(lab: Lab) -> str:
