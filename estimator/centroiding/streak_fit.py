@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from estimator.centroiding.moments import neighbors
 from estimator.core import least_squares
 from estimator.core.checks import Floats, Ints
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.detection.background import FILTERED_NOISE, interpolate
 
 # Margin of the window about the streak, and its largest half-width.
@@ -119,7 +119,7 @@ def fit_all(
     return out
 
 
-@jit
+@inlined
 def _offsets_of_others(xy: Floats, near: Ints, n: int, p: Floats) -> Floats:
     """Return the (K, 2) offsets of nearby blobs from blob n, without those that may be fragments of its streak."""
     offsets = xy[near] - xy[n]
@@ -128,7 +128,7 @@ def _offsets_of_others(xy: Floats, near: Ints, n: int, p: Floats) -> Floats:
     return offsets[(np.abs(across) > CORE_PX) | (np.abs(along) > p[LENGTH])]
 
 
-@jit
+@inlined
 def _select_pixels(
     image: NDArray,
     offsets: Floats,
@@ -259,7 +259,7 @@ def _fit(
     return False
 
 
-@jit
+@inlined
 def _add_priors(normal: Floats, p: Floats, start: Floats, tightness: float) -> None:
     """Add the priors on length, direction and width to the normal matrix."""
     length_sigma = tightness * length_sigma_px(start[LENGTH])
@@ -270,7 +270,7 @@ def _add_priors(normal: Floats, p: Floats, start: Floats, tightness: float) -> N
     least_squares.add_prior(normal, WIDTH, start[WIDTH] - p[WIDTH], width_sigma)
 
 
-@jit
+@inlined
 def _apply_step(step: Floats, p: Floats) -> float:
     """Add a step to `p`, shortened so that center, length and direction move an end by about a pixel at most.
 
@@ -284,7 +284,7 @@ def _apply_step(step: Floats, p: Floats) -> float:
     return largest_step
 
 
-@jit
+@inlined
 def _is_near(p: Floats, start: Floats) -> bool:
     """Return whether the parameters are still those of a streak near the start."""
     if abs(p[X] - start[X]) + abs(p[Y] - start[Y]) > 2 + start[LENGTH] / 2:
@@ -292,7 +292,7 @@ def _is_near(p: Floats, start: Floats) -> bool:
     return p[FLUX] > 0 and MIN_STREAK_PX < p[LENGTH] < 2 * start[LENGTH] + 4
 
 
-@jit
+@inlined
 def _write_streak(
     factor: Floats,
     p: Floats,
@@ -314,7 +314,7 @@ def _write_streak(
     out[7] += end_variance * dx * dy
 
 
-@jit
+@inlined
 def _own_vector(
     factor: Floats, p: Floats, start: Floats, misfit: float, ends_px2: float, out: Floats
 ) -> None:
@@ -366,7 +366,7 @@ def _own_vector(
     out[:] = length * c, length * s, own[0, 0], own[1, 1], own[0, 1]
 
 
-@jit
+@inlined
 def _fading(pixels: Floats, rows: Floats, weight: Floats, p: Floats) -> tuple[float, float]:
     """Return how far the fit's center is from the center of light along the streak, px, and the variance of that.
 
@@ -388,7 +388,7 @@ def _fading(pixels: Floats, rows: Floats, weight: Floats, p: Floats) -> tuple[fl
     return fading * ahead, (1 / information + FADING_SIGMA**2) * ahead**2
 
 
-@jit
+@inlined
 def _end_variance_px2(p: Floats, noise: float, gain_e_dn: float) -> float:
     """Return the variance along the streak that the Cramer-Rao bound omits: the error of locating its ends in noise.
 

@@ -208,7 +208,8 @@ def part_pairs(
                 break
         for k in range(1, PART if misfit <= most_misfit else 1):
             if abs(dome.near_chord[i, k] - seen[-1]) <= gate + slack[-1]:
-                pairs[count] = i, dome.near[i, k]
+                pairs[count, 0] = i
+                pairs[count, 1] = dome.near[i, k]
                 count += 1
     return pairs[:count], gate
 

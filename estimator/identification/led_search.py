@@ -218,7 +218,8 @@ def _ordered_pairs(detections: LedDetections, dome: DomeIndex) -> NDArray[np.int
                 continue
             begin, end, _ = _pair_range(detections, dome, a, b)
             # The cost: number of LED pairs, or one beyond all of these for a short pair.
-            pair[count] = a, b
+            pair[count, 0] = a
+            pair[count, 1] = b
             cost[count] = end - begin if length >= min_length else 1e9 - length
             count += 1
     return pair[:count][np.argsort(cost[:count])]
@@ -315,8 +316,9 @@ def _test_pair(
         begin, end, gate = _pair_range(detections, dome, a, b)
         required = _required_matches(detections, dome, a, b, min_dex)
         pairs = np.empty((2 * (end - begin), 2), np.int32)
-        pairs[::2] = index.pair[begin:end]
-        pairs[1::2] = index.pair[begin:end, ::-1]
+        for n in range(end - begin):
+            for k in range(2):
+                pairs[2 * n, k] = pairs[2 * n + 1, 1 - k] = index.pair[begin + n, k]
     gates = pair_gates(detections, dome, a, b)
     in_cam = np.empty((3, 3))
     in_lab = np.empty((3, 3))

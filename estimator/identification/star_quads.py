@@ -22,7 +22,7 @@ from estimator.catalog.quad_index import SIDE, QuadIndex
 from estimator.catalog.sky_index import SkyIndex
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.identification import star_search
 from estimator.identification.chance import GATE_SIGMA
 from estimator.identification.star_detections import Detections, chosen, ray, spread
@@ -94,7 +94,7 @@ def _search(
     return no_hypothesis()
 
 
-@jit
+@inlined
 def _test_quad(
     detections: Detections, quads: QuadIndex, sky: SkyIndex, quad: Ints, checks: Ints
 ) -> Hypothesis:
@@ -162,7 +162,7 @@ def _alike(codes: Floats, q: int, code: Floats, gate: float) -> bool:
     return alike
 
 
-@jit
+@inlined
 def _longest_first(tangent: Floats, quad: Ints) -> None:
     """Reorder four detections in place, so that the first two are the ones farthest apart."""
     longest = -1.0
@@ -180,7 +180,7 @@ def _longest_first(tangent: Floats, quad: Ints) -> None:
     quad[1], quad[second] = quad[second], quad[1]
 
 
-@jit
+@inlined
 def _code_gate(detections: Detections, quad: Ints, length: float) -> float:
     """Greatest difference of the codes of a quad of stars and of its image.
 

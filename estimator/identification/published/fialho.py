@@ -39,7 +39,7 @@ from numpy.typing import NDArray
 from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
 from estimator.core.checks import Floats, frozen
 from estimator.core.errors import ImageError
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import StarMatch
 from estimator.core.vectors import Vector, row, squared_chord
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -361,7 +361,7 @@ def _candidate(index: PairIndex, star: int, magnitude: float, options: FialhoOpt
     return squared_chord(row(index.vectors, star), options.boresight) <= options.chord2
 
 
-@jit
+@inlined
 def _test_neighbors(
     rays: Floats,
     magnitudes: Floats,
@@ -431,7 +431,7 @@ def _all_candidates(index: PairIndex, magnitude: float, options: FialhoOptions) 
     return out[:count]
 
 
-@jit
+@inlined
 def _test_lists(
     rays: Floats,
     magnitudes: Floats,

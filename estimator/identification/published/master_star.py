@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, magnitude_range, neighbor_range
 from estimator.core.checks import Floats
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
 from estimator.identification.direct_match import (
@@ -162,7 +162,7 @@ def contradict(first: DirectMatch, second: DirectMatch) -> bool:
     return False
 
 
-@jit
+@inlined
 def _count_angles(
     rays: Floats,
     index: PairIndex,
@@ -182,7 +182,7 @@ def _count_angles(
     return count
 
 
-@jit
+@inlined
 def _best_match(
     rays: Floats,
     index: PairIndex,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
 from estimator.identification.direct_match import (
@@ -208,7 +208,7 @@ def _triangle(
     return no_match()
 
 
-@jit
+@inlined
 def _pyramid(
     rays: Floats,
     index: PairIndex,
@@ -251,7 +251,7 @@ def _pyramid(
     return no_match()
 
 
-@jit
+@inlined
 def _scale_tangents(rays: Floats, factor: float) -> Floats:
     """The (N, 3) unit vectors with their tangents multiplied by a factor, as if the focal length were shorter by it."""
     out = np.empty_like(rays)
@@ -265,7 +265,7 @@ def _scale_tangents(rays: Floats, factor: float) -> Floats:
     return out
 
 
-@jit
+@inlined
 def _match_with_penalty(
     rays: Floats,
     index: PairIndex,
@@ -288,7 +288,7 @@ def _match_with_penalty(
     return DirectMatch(match.observed, match.star, match.R_cam_from_ref, chance)
 
 
-@jit
+@inlined
 def _count_in_field(
     index: PairIndex, center: int, R_cam_from_ref: Floats, options: PyramidOptions
 ) -> int:

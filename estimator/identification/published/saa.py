@@ -31,7 +31,7 @@ from estimator.catalog.sky_index import within
 from estimator.core import vectors
 from estimator.core.checks import Floats, Ints
 from estimator.core.errors import ImageError
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.direct_match import angle
@@ -129,7 +129,7 @@ def match_assumptions(
     return star[:count], cost[:count], matches[:count]
 
 
-@jit
+@inlined
 def _partners(
     stars: SearchInput,
     primary: Primary,
@@ -189,7 +189,7 @@ def _partners(
                 partner_cost[k] = cost
 
 
-@jit
+@inlined
 def _remove_duplicates(partner: NDArray, partner_cost: Floats) -> int:
     """Keep each catalog star for the observed star of least cost; return the number of matches."""
     count = 0

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import StarMatch
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES, log10_tail
 from estimator.identification.direct_match import (
@@ -239,7 +239,7 @@ def _triangle(
     return no_match()
 
 
-@jit
+@inlined
 def _angle_gates(rays: Floats, corners: NDArray, options: ShefexOptions) -> Floats:
     """Gates of each observed star's three angles to the base.
 
@@ -263,7 +263,7 @@ def _angle_gates(rays: Floats, corners: NDArray, options: ShefexOptions) -> Floa
     return gates
 
 
-@jit
+@inlined
 def _match_others(
     rays: Floats,
     index: PairIndex,
@@ -325,7 +325,7 @@ def _match_others(
     )
 
 
-@jit
+@inlined
 def _partner(
     rays: Floats,
     index: PairIndex,
@@ -368,7 +368,7 @@ def _partner(
     return best
 
 
-@jit
+@inlined
 def _same_side(
     rays: Floats, index: PairIndex, corners: NDArray, stars: NDArray, n: int, d: int
 ) -> bool:
@@ -390,7 +390,7 @@ def _same_side(
     return product > 0
 
 
-@jit
+@inlined
 def _gate_area(rays: Floats, corners: NDArray, n: int, side: Floats, width: Floats) -> float:
     """Area in which a star can be identified by its angles, sr.
 

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from estimator.catalog.pair_index import PairIndex, neighbor_range, pair_range
 from estimator.core.checks import Floats
-from estimator.core.jit import jit
+from estimator.core.jit import inlined, jit
 from estimator.core.types import StarMatch
 from estimator.core.vectors import dot, norm
 from estimator.identification.chance import ACCEPT_LOG10_CHANCE, MIN_MATCHES
@@ -146,7 +146,7 @@ def search(rays: Floats, index: PairIndex, options: TriangleOptions) -> DirectMa
     return no_match()
 
 
-@jit
+@inlined
 def _catalog_triangles(
     rays: Floats, index: PairIndex, corners: NDArray, options: TriangleOptions, tried: NDArray
 ) -> DirectMatch:
@@ -221,7 +221,7 @@ def _catalog_triangles(
     return best if rival > best.log10_chance - ACCEPT_LOG10_CHANCE else no_match()
 
 
-@jit
+@inlined
 def _corners(rays: Floats, corners: NDArray) -> NDArray:
     """The corners in the order: that of the longest and the shortest side, the longest's other one, the third."""
     ordered = corners.copy()
@@ -236,7 +236,7 @@ def _corners(rays: Floats, corners: NDArray) -> NDArray:
     return ordered
 
 
-@jit
+@inlined
 def _shortest_side(
     longest: float, area: float, square: float, margin: float
 ) -> tuple[float, float]:
