@@ -14,6 +14,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.lib import format as npy
+from pydantic_core import to_json
 
 from estimator.core.camera import Camera
 from estimator.core.errors import ImageError
@@ -365,10 +366,6 @@ class Storage:
 IMAGE_NAME = {False: "image.npy", True: "image.npz"}  # of a frame in a tar; True: compressed
 COCO_SNR = 3.0  # sources below have no annotation; they are in the other labels
 CATEGORIES = ("source", *MASKS)
-SOURCE_JSON = (
-    '{"id": %d, "image_id": %d, "category_id": 1, "bbox": [%s], "area": %r, '
-    '"segmentation": [[%s]], "iscrowd": 0, "source": %d, "electrons": %r, "detected": %s}'
-)
 
 
 def key_of(frame: int) -> str:
@@ -470,26 +467,30 @@ def coco_image(labels: Record, compress: bool) -> Record:
 def coco_annotations(one: LabelledFrame, number: int) -> bytes:
     """JSON objects, joined by commas: outlines of the sources, and masks of the rest as crowds.
 
-    Ids are unique in the dataset. A source is written as `json.dumps` would, but faster.
+    Ids are unique in the dataset.
     """
     seen = one.sources["snr"] >= COCO_SNR
     rows = one.sources[seen]
     first = number * 100_000 + 1
     boxes, corners = outlines(taken(one.extents, seen))
-    ids = rows["id"].tolist()
-    detected = (("false", "true")[one] for one in rows["detected"].tolist())
-    areas = (boxes[:, 2] * boxes[:, 3]).tolist()
-    columns = (
-        hundredths(boxes),
-        areas,
-        hundredths(corners),
-        ids,
-        rows["electrons"].tolist(),
-        detected,
-    )
-    found = [
-        SOURCE_JSON % (first + n, number, *each)
-        for n, each in enumerate(zip(*columns, strict=True))
+    areas = boxes[:, 2] * boxes[:, 3]
+    columns = (boxes, areas, corners, rows["id"], rows["electrons"], rows["detected"])
+    found: list[Record] = [
+        {
+            "id": first + n,
+            "image_id": number,
+            "category_id": 1,
+            "bbox": box,
+            "area": area,
+            "segmentation": [corner],
+            "iscrowd": 0,
+            "source": source,
+            "electrons": electrons,
+            "detected": detected,
+        }
+        for n, (box, area, corner, source, electrons, detected) in enumerate(
+            zip(*(column.tolist() for column in columns), strict=True)
+        )
     ]
     height, width = one.frame.image_dn.shape
     for name, counts in one.masks.items():
@@ -503,8 +504,9 @@ def coco_annotations(one: LabelledFrame, number: int) -> bytes:
                 "segmentation": {"size": [height, width], "counts": counts},
                 "iscrowd": 1,
             }
-            found.append(json.dumps(mask))
-    return ", ".join(found).encode()
+            found.append(mask)
+    # A quarter of the time of `json.dumps`
+    return to_json(found)[1:-1]
 
 
 def outlines(extents: Extents) -> tuple[Floats, Floats]:
@@ -521,11 +523,6 @@ def outlines(extents: Extents) -> tuple[Floats, Floats]:
     low = corners.min(axis=1)
     high = corners.max(axis=1)
     return np.round(np.column_stack([low, high - low]), 2), corners.reshape(-1, 8)
-
-
-def hundredths(numbers: Floats) -> list[str]:
-    """The rows of (N, K) finite numbers with two decimals, as `json.dumps` writes a list without its brackets."""
-    return [str(row)[1:-1] for row in np.round(numbers, 2).tolist()]
 
 
 def mask_box(counts: list[int], height: int) -> list[float]:
