@@ -20,7 +20,7 @@ jit = partial(
     no_cfunc_wrapper=True,
     nogil=True,
 )
-# For functions that one other function calls: LLVM optimizes a called function by itself, and once more in its caller.
+# For functions with one caller in most runs: LLVM optimizes a called function by itself, and once more in its caller.
 inlined = partial(jit, inline="always")
 
 COMPILATION = event.TimingListener()

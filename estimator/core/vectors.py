@@ -81,7 +81,7 @@ def rotate(matrix: Floats, u: Vector) -> Vector:
 
 @jit
 def set_row(matrix: Floats, n: int, u: Vector) -> None:
-    """Set row n of a matrix (N, 3); numba compiles `matrix[n] = u` for arrays of any shape, in four times the time."""
+    """Set row n of a matrix (N, 3); numba compiles `matrix[n] = u` for any shapes, in four times the time."""
     for k in range(3):
         matrix[n, k] = u[k]
 

@@ -401,7 +401,7 @@ def _close(
                     closed[found, 1] = k
                     found += 1
             if count < len(entries):
-                vectors.set_row(entries, count, (i, k, p))
+                vectors.set_row(entries, count, (i, k, p))  # its first three elements
                 entries[count, 3] = last[i]
                 ratios[count] = ratio
                 count += 1

@@ -572,7 +572,7 @@ class Flight:
         return Shot(camera, window, frame, truth, report, rate, update_status, clock.seconds)
 
     def tracker_of(self, schedule: Schedule, frame: Frame) -> factory.Estimator:
-        """The tracker of a camera. A new one first solves the frame once, so later times contain no compilation.
+        """The tracker of a camera. A new one first solves the frame once, so no time contains the making of tables.
 
         External trackers do not: each frame must reach them once, in order.
         """

@@ -217,7 +217,7 @@ def compiled_modules() -> list[str]:
     return [
         ".".join(path.relative_to(ROOT).with_suffix("").parts)
         for path in files
-        if re.search(r"^\s*@jit", path.read_text(), re.MULTILINE)
+        if re.search(r"^\s*@(jit|inlined|loop)", path.read_text(), re.MULTILINE)
     ]
 
 

@@ -27,7 +27,12 @@ FRAME = ("--frames", "1", "--out", "{folder}")
 ALGORITHMS = ("tests.helpers.compilation", "--algorithms")  # and stages
 BLIND = ("skysim", "solve", "{folder}/frame_0000.png")
 BASIC: tuple[tuple[Step, ...], ...] = (
-    ((IDENTIFY, "shefex2"), ("skysim", "run", "shefex2", *FRAME), BLIND),
+    (
+        (IDENTIFY, "shefex2"),
+        ("skysim", "render", "shefex2", *FRAME),
+        ("skysim", "run", "shefex2", *FRAME),
+        BLIND,
+    ),
     (("skysim", "render", "afit_simsat", *FRAME), ("skysim", "run", "afit_simsat", *FRAME)),
 )
 # After the basic steps. Of the estimator: codes, and every algorithm that a setting can name.
@@ -82,7 +87,7 @@ def compile_algorithms(stages: Sequence[str]) -> None:
 
 def main(words: Sequence[str]) -> None:
     """Compile the basic steps, or all, in as many processes as there are groups."""
-    if "--algorithms" in words:
+    if words[:1] == ["--algorithms"]:
         compile_algorithms(words[1:])
         return
     groups = BASIC

@@ -495,13 +495,14 @@ def test_an_attitude_from_the_brightest_lights_must_be_confirmed_by_all(
         few, SKY, truth.as_matrix(), 1.0, gates_of(few, 1.5), -np.inf
     )
     assert candidate.dex > star_search.ACCEPT_DEX
-    found = star_search.fit_to_all(
-        lights._replace(limit_mag=limit_mag),
-        SKY,
-        candidate,
-        True,
-    )
+    found = PLAIN.fit_to_all(lights._replace(limit_mag=limit_mag), SKY, candidate, True)
     assert len(found.star) == matches
+
+
+def test_the_farthest_corner_of_a_field_off_the_axis_is_on_its_longer_sides() -> None:
+    """sqrt(0.12^2 + 0.08^2) of the field from -0.1 to 0.12 by -0.08 to 0.06."""
+    corner = PLAIN.squared_corner(np.array([-0.1, 0.12, -0.08, 0.06]))
+    assert corner == pytest.approx(0.12**2 + 0.08**2)
 
 
 def test_the_limiting_magnitude_is_taken_at_the_median_light() -> None:
