@@ -359,6 +359,7 @@ class Tab(context.PageContext):
                     f"{name} cannot be set up:", self.message_text, in_vain=True
                 )
             return False
+        self.history.write()  # the former view is a step, however short it was shown
         self.scene_info, view = result
         shown = self.scene_info.head
         running = self.study_panel.running
