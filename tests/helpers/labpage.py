@@ -166,7 +166,7 @@ def second(browser: Any, server: Server) -> Iterator[Any]:
 
 
 def pictured(page: Any, name: str) -> None:
-    """Save a screenshot of the page; in CI nobody looks at it, so none is saved."""
+    """Save a screenshot of the page. CI saves none."""
     if os.environ.get("CI"):
         return
     PICTURES.mkdir(parents=True, exist_ok=True)

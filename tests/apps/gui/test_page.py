@@ -137,6 +137,9 @@ def test_the_marks_are_drawn_on_their_stars(page: Any) -> None:
 
 def test_a_typed_attitude_is_identified_by_key_1(page: Any) -> None:
     page.keyboard.press("F5")
+    # The server moves the focus; later, it would take it from a field that is being filled.
+    first = page.locator(".lab-angle").first
+    assert come(lambda: first.evaluate("at => at === document.activeElement"))
     for n, angle in enumerate(("120", "-30", "0"), 1):
         page.locator(".lab-angle").nth(n - 1).fill(angle)
     frame = source(page)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
@@ -91,6 +93,21 @@ def test_streak_vectors_match_the_rotating_camera() -> None:
     found = np.column_stack([rows["streak_x_px"], rows["streak_y_px"]])
     np.testing.assert_allclose(found, end - begin, atol=2e-3)
     assert np.linalg.norm(found, axis=1).min() > 1
+
+
+def test_annotations_are_the_outlines_to_the_last_digit_and_none_without_sources() -> None:
+    one = dataset_shards.label_frame(setup_with(), 5)
+    seen = one.sources["snr"] >= dataset_shards.COCO_SNR
+    boxes, corners = dataset_shards.outlines(taken(one.extents, seen))
+    text = dataset_shards.coco_annotations(one, 7)
+    found = [each for each in json.loads(b"[%b]" % text) if each["category_id"] == 1]
+    assert len(found) > 5
+    assert [each["bbox"] for each in found] == boxes.tolist()
+    assert [each["segmentation"] for each in found] == corners[:, None].tolist()
+    none = one._replace(
+        sources=one.sources[:0], extents=taken(one.extents, slice(0)), masks={}
+    )
+    assert dataset_shards.coco_annotations(none, 7) == b""
 
 
 def test_bright_sources_are_detected_where_their_light_is() -> None:

@@ -359,7 +359,7 @@ class Tab(context.PageContext):
                     f"{name} cannot be set up:", self.message_text, in_vain=True
                 )
             return False
-        self.history.write()  # the former view is a step, however short it was shown
+        self.end_step()  # the former view is a step, however short it was shown
         self.scene_info, view = result
         shown = self.scene_info.head
         running = self.study_panel.running
@@ -551,7 +551,7 @@ class History:
         ui.run_javascript(f"skysimHistory.write({arguments})")
 
     def end_step(self) -> None:
-        """Make the next change of attitude a step of its own, because another action makes it."""
+        """Make the next change a step of its own, because another action makes it."""
         self.write()
         self.moving = False
 

@@ -65,7 +65,7 @@ class PageContext:
     log
         Function that adds a line to the log
     end_step
-        Function that makes the next change of attitude a step of its own for undo
+        Function that makes the next change a step of its own for undo
     derived
         For each part that shows something derived from the page's view: a function that returns what it is derived
         from, and one that empties the part
